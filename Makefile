@@ -1,10 +1,9 @@
 # make demo       install, train GRBM on the embedded data set, print the per-region table
 # make test       install, lint-free default test suite (offline, two cores, minutes)
-# make test-all   the slow tests as well
-# make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
+# make test-all   every test: the slow ones, the pages, PostgreSQL and MLflow servers on loopback
 # make lint       formatting, lint, types, spelling
 # make results  rewrites docs/results, its figures and the marked numbers from the archive results/
-# make docs       checks the pages and their code, builds the site into site/index.html
+# make docs       checks the pages and their code, builds the site (make site: alone)
 # make mutants    named faults (tests/mutants/*.yaml), each of which a test has to find
 # make bench      benchmarks, as ratios measured in one run
 
@@ -23,23 +22,21 @@ TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt swee
 # Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
 MARKED := README.md,docs/results/spatial-bias.md
 
-.PHONY: demo test test-all test-servers lint docs results mutants bench
+.PHONY: demo test test-all lint docs site results mutants bench
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
 
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest $(SPREAD) -m "not slow and not benchmark and not servers and not docs"
+	$(BIN)/python -m pytest $(SPREAD) -m "not slow and not docs"
 
+# Some tests start PostgreSQL, which the first call installs where it is missing.
 test-all: $(VENV)/.ready
-	$(BIN)/python -m pytest $(SPREAD) -m "not benchmark and not servers"
-
-test-servers: $(VENV)/.ready
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || { \
 	  echo "PostgreSQL is missing; installing the Debian package"; \
 	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq --no-install-recommends postgresql; \
 	  else sudo apt-get update -qq && sudo apt-get install -y -qq --no-install-recommends postgresql; fi; }
-	$(BIN)/python -m pytest -m servers
+	$(BIN)/python -m pytest $(SPREAD)
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
@@ -49,6 +46,9 @@ lint: $(VENV)/.ready
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m pytest $(SPREAD) -m "docs and not slow" tests/docs
+	$(MAKE) site
+
+site: $(VENV)/.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "built site/index.html; with search: $(BIN)/python -m http.server --directory site"
 

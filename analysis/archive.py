@@ -30,6 +30,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.commands import Archive
 from rgbt.checks import InputError, one_line
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
@@ -226,8 +227,6 @@ def _digest(content: bytes) -> str:
 
 
 # Commands.
-
-Archive = Annotated[Path, Help("folder of the archive")]
 
 
 @dataclass(frozen=True)

@@ -5,19 +5,17 @@ One table and one sentence: the differences with intervals and p-values, over im
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
-from analysis.results import Evaluation, groups_in, label_of, open_counts
-from analysis.uncertainty import Comparison, Interval, Resampling, compare
+from analysis.commands import Archive, DrawOptions, check_out, write_files
+from analysis.results import Evaluation, label_of, open_counts
+from analysis.uncertainty import Comparison, Interval, Resampling, compare, sentence
 from analysis.uncertainty.blocks import FEWEST
-from analysis.uncertainty.same_images import common
-from analysis.uncertainty.sentence import sentence
 from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
@@ -28,13 +26,16 @@ from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import parse
 from rgbt.metrics.pairs import HEADLINES, protocol_of
-from rgbt.metrics.scores import absent_notes
+from rgbt.metrics.scores import absent_notes, absent_rule
 from rgbt.tables import ABSENT, TextTable, number
-from rgbt.terminal import info, plain_text, print_rich, rich_table
+from rgbt.terminal import plain_text, print_rich, rich_table
+
+if TYPE_CHECKING:  # --help answers without waiting for pandas
+    import pandas as pd
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(DrawOptions):
     """Options of ``rgbt compare``."""
 
     a: Annotated[
@@ -44,8 +45,8 @@ class Options:
             'rgbt evaluate or rgbt score), a group of runs ("grbm sigma_div=2": all its seeds), '
             "or a list of these with commas: seeds of one method"
         ),
-    ] = ""
-    b: Annotated[str, Help("second method, in the same form as a")] = ""
+    ]
+    b: Annotated[str, Help("second method, in the same form as a")]
     metrics: Annotated[
         str,
         Help(
@@ -66,20 +67,6 @@ class Options:
     condition: Annotated[
         str, Help('input (rgbt evaluate) or corruption (rgbt robustness): thermal, "noise:rgb 16"')
     ] = ""
-    paired: Annotated[
-        bool,
-        Help(
-            "a and b are the same trainings, measured in two ways, such as along an exact and an "
-            "estimated flow; they may count other pixels"
-        ),
-    ] = False
-    missing: Annotated[
-        Literal["refuse", "leave_out"],
-        Help("images that only one method has: refuse the comparison, or leave_out: exclude them"),
-    ] = "refuse"
-    level: Level = 0.95
-    resamples: Resamples = 10_000
-    blocks: Blocks = "auto"
     absent: Annotated[
         Literal["as counted", "released", "exclude"],
         Help(
@@ -87,7 +74,6 @@ class Options:
             "convention of the data set"
         ),
     ] = "as counted"
-    seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
     archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of comparison.md and comparison.csv")] = None
@@ -96,32 +82,34 @@ class Options:
 def main(options: Options, _: list[str]) -> int:
     """Compare two methods on the same images."""
     check_out(options.out)
-    opened = _opened(options)
-    a, b = _counts(opened, options.missing)
-    settings = Resampling(
-        resamples=options.resamples,
-        level=options.level,
-        blocks=options.blocks,
-        seed=options.seed,
-        absent=None if options.absent == "as counted" else options.absent,
-    )
-    metrics, paired = metrics_of(options.metrics, [*a, *b], settings), options.paired
-    found = compare(a, b, metrics, settings, paired=paired, same_pixels=not paired)
+    if options.condition and options.frames:
+        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
+    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
+    opened = [open_counts(side, *stored) for side in (options.a, options.b)]
+    if shared := {each.path for each in opened[0]} & {each.path for each in opened[1]}:
+        raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
+    a, b = ([each.counts for each in side] for side in opened)
+    settings = options.settings(None if options.absent == "as counted" else options.absent)
+    found = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
     shown = f" ({options.condition})" if options.condition else ""
     labels = [f"{label}{shown}" for label in _labels(opened)]
     grid = comparison_grid(found, labels, absent_classes([*a, *b], settings.absent))
     said = sentence(found, *labels)
     print_rich(rich_table(grid))
     # Scores by day and by night are over other images.
-    drawn = {parse(each.metric).part: each.a.said for each in found.differences}
+    drawn = {parse(each.metric).part: each.a.evidence.said for each in found.differences}
     parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
+    lists = [" or ".join(sorted({e.run.lists for e in each if e.run})) for each in opened]
+    if lists[0] != lists[1] and all(lists):
+        parts.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
-        f"images, seeds {'in pairs' if paired else 'by Welch'}; p of the last interval; Holm: "
-        "corrected for the number of lines."
+        "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
-    print_rich(plain_text("\n".join(filter(None, [said, *parts, found.reason, remark]))))
-    write_tables(options.out, "comparison", f"{grid.to_markdown()}\n{said}\n", _rows(found))
+    lines = [said, *parts, found.evidence.reason, remark]
+    print_rich(plain_text("\n".join(filter(None, lines))))
+    text = f"{grid.to_markdown()}\n{said}\n"
+    write_files(options.out, {"comparison.md": text, "comparison.csv": comparison_frame(found)})
     return 0
 
 
@@ -173,61 +161,36 @@ def comparison_grid(
     level = f"{100 * found.level:g} % over images"
     over = [level, f"{level} and seeds"][: 1 + with_seeds]
     singles = f"{found.images} single images"
-    drawn = singles if found.said == singles else f"{found.images} images, {found.said}"
+    said = found.evidence.said
+    drawn = singles if said == singles else f"{found.images} images, {said}"
     title = f"{labels[1]} minus {labels[0]}: {drawn}, {found.partition}"
     return TextTable(title, ("", *labels, "difference", *over, "p", "p (Holm)"), tuple(rows), notes)
 
 
-def _rows(found: Comparison) -> Iterator[tuple[object, ...]]:
-    """One line per score with all digits."""
-    ends = ("images_low", "images_high", "both_low", "both_high", "p", "p_holm")
-    yield ("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends)
+def comparison_frame(found: Comparison) -> pd.DataFrame:
+    """One row per score; NaN where there is no interval."""
+    import pandas as pd
+
+    none = Interval(float("nan"), float("nan"))
+    rows = []
     for each in found.differences:
-        intervals = (each.difference.images, each.difference.both)
-        bounds = [end for i in intervals for end in ((i.low, i.high) if i else ("", ""))]
+        intervals = (each.difference.images or none, each.difference.both or none)
+        bounds = [end for interval in intervals for end in (interval.low, interval.high)]
         scores = each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value
-        yield (each.metric, *scores, *bounds, each.difference.p, each.p_corrected)
+        rows.append((each.metric, *scores, *bounds, each.difference.p, each.p_corrected))
+    columns = ["metric", "a", "b", "seeds_a", "seeds_b", "difference"]
+    columns += ["images_low", "images_high", "both_low", "both_high", "p", "p_holm"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
-    """Footnotes about classes that the counts of both methods lack, by `absent` or as counted."""
-    first = every[0]
+    """How absent classes count, by `absent` or as counted, and which both methods lack."""
+    first, used = every[0], absent or convention(every)
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
-        return ()  # matrices of pairs of frames and of boundaries have no labels as rows
+        return (absent_rule(used),)  # their matrices have no labels as rows
     summed = np.sum([counts.by_region() for counts in every], axis=0)
-    used = absent or convention(every)
-    return absent_notes(summed, first.classes, first.scored, first.split, used)
-
-
-def _opened(options: Options) -> list[tuple[Evaluation, ...]]:
-    """The trainings of both methods."""
-    if options.condition and options.frames:
-        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
-    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
-    for key, side in (("a", options.a), ("b", options.b)):
-        if not side:
-            groups = ", ".join(groups_in(options.runs_dir, options.archive)) or "none"
-            raise InputError(
-                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
-                f"in {options.runs_dir}: {groups}."
-            )
-    return [open_counts(side, *stored) for side in (options.a, options.b)]
-
-
-def _counts(
-    opened: Sequence[tuple[Evaluation, ...]], missing: str
-) -> tuple[list[Counts], list[Counts]]:
-    methods = [[named.counts for named in each] for each in opened]
-    shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
-    if shared:
-        raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
-    if missing == "leave_out":
-        before = len({name for seeds in methods for counts in seeds for name in counts.names})
-        methods = common(methods)
-        left = before - len(methods[0][0].names)
-        if left:
-            info(f"{left} of {before} images are not in all counts and were excluded.")
-    return methods[0], methods[1]
+    notes = absent_notes(summed, first.classes, first.scored, first.split, used)
+    return (absent_rule(used), *notes)
 
 
 def _labels(opened: Sequence[tuple[Evaluation, ...]]) -> list[str]:

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.commands import Archive, DrawOptions, check_out, write_files
 from analysis.results import Evaluation, evaluations_of, label_of, open_counts
-from analysis.uncertainty import Estimate, Resampling, estimate
+from analysis.uncertainty import Estimate, estimate
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
@@ -22,9 +22,13 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import KINDS, details_of, regions_of
 from rgbt.metrics.score_grid import ScoreGrid, score_grid
+from rgbt.metrics.scores import absent_rule
 from rgbt.tables import TextTable, number
 from rgbt.terminal import print_rich, rich_table
 from rgbt.types import VIEWS
+
+if TYPE_CHECKING:  # --help answers without waiting for pandas
+    import pandas as pd
 
 Key = tuple[str, str]
 """Input of the network ("" where a file does not tell), and partition of the counts."""
@@ -32,8 +36,8 @@ Key = tuple[str, str]
 Scores = tuple[ScoreGrid, Mapping[str, Estimate]]
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(DrawOptions):
     """Options of ``rgbt details``."""
 
     run: Annotated[
@@ -42,12 +46,8 @@ class Options:
             "a run (folder, config key or MLflow run id), a group of runs (all seeds), a file of "
             "counts (.npz), or a list of these with commas: seeds of one method"
         ),
-    ] = ""
+    ]
     split: Annotated[str, Help("split of the runs")] = "test"
-    level: Level = 0.95
-    resamples: Resamples = 10_000
-    blocks: Blocks = "auto"
-    seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
     archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of details.md and details.csv")] = None
@@ -56,11 +56,7 @@ class Options:
 def main(options: Options, _: list[str]) -> int:
     """Show every stored score of a method by region, class, bin and input."""
     check_out(options.out)
-    if not options.run:
-        raise InputError("'run' has no value; give a run, a group of runs, or a file of counts.")
-    settings = Resampling(
-        resamples=options.resamples, level=options.level, blocks=options.blocks, seed=options.seed
-    )
+    settings = options.settings()
     opened = open_counts(options.run, options.runs_dir, archive=options.archive)
     found: dict[Key, Scores] = {}
     for key, counts in _stored(opened, options.split).items():
@@ -69,15 +65,15 @@ def main(options: Options, _: list[str]) -> int:
     grids = list(_grids(found, label_of(opened)))
     for each in grids:
         print_rich(rich_table(each))
-    first = next(iter(next(iter(found.values()))[1].values()))
+    evidence = next(iter(next(iter(found.values()))[1].values())).evidence
     seeds = " and seeds" if len(opened) > 1 else ""
     remark = (
-        f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({first.said}), "
-        f"{settings.resamples} resamples. {first.reason}"
-    ).strip()
+        f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({evidence.said}), "
+        f"{settings.resamples} resamples. {evidence.reason} {absent_rule(opened[0].counts.absent)}"
+    )
     print_rich(remark)
     text = "\n".join([*(each.to_markdown() for each in grids), remark, ""])
-    write_tables(options.out, "details", text, _rows(found))
+    write_files(options.out, {"details.md": text, "details.csv": _frame(found)})
     return 0
 
 
@@ -135,15 +131,19 @@ def _cells(estimates: Mapping[str, Estimate], metrics: Sequence[str]) -> Iterato
         yield number(each.value) + (f" [{ends.low:.2f}, {ends.high:.2f}]" if ends else "")
 
 
-def _rows(found: Mapping[Key, Scores]) -> Iterator[tuple[object, ...]]:
-    """One line per score with all digits."""
-    yield "regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high"
+def _frame(found: Mapping[Key, Scores]) -> pd.DataFrame:
+    """One row per score; NaN where there is no interval."""
+    import pandas as pd
+
+    rows = []
     for (view, partition), (_, estimates) in found.items():
         details = details_of(partition)
+        about = regions_of(partition), details.kind if details else "", view
         for metric, each in estimates.items():
-            ends = (each.interval.low, each.interval.high) if each.interval else ("", "")
-            of = regions_of(partition), details.kind if details else "", view, metric
-            yield (*of, each.value, each.sd, each.seeds, *ends)
+            ends = (each.interval.low, each.interval.high) if each.interval else (None, None)
+            rows.append((*about, metric, each.value, each.sd, each.seeds, *ends))
+    columns = ["regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 entry = PlainCommand(Options, main, heeds=())

@@ -1,4 +1,7 @@
-"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name."""
+"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name.
+
+Also the counts of corrupted images, which ``rgbt robustness`` writes beside a run or to ``out=``.
+"""
 
 from __future__ import annotations
 
@@ -311,11 +314,6 @@ def _check_trainings_differ(text: str, found: Sequence[Evaluation]) -> None:
             )
 
 
-def groups_in(runs_dir: Path | str, archive: Path | str = "results") -> list[str]:
-    """Names of all groups of finished runs."""
-    return sorted({run.tags.get(GROUP, "") for run in finished_runs(runs_dir, archive)} - {""})
-
-
 def label_of(counts: Sequence[Evaluation]) -> str:
     """Name of a method: its group, or the names of all its counts."""
     return " + ".join(dict.fromkeys(each.label for each in counts))
@@ -374,3 +372,37 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
 def _is_plain(counts: Counts) -> bool:
     """Whether they are of single frames, without details."""
     return details_of(counts.partition) is None and protocol_of(counts.partition) is None
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training on corrupted images; its levels: clean, then by title and rising severity."""
+
+    label: str
+    levels: tuple[Evaluation, ...]
+
+
+def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
+    """The trainings that `text` names (see `open_counts`), with all levels of rgbt robustness.
+
+    A word may also name a folder that ``rgbt robustness out=...`` wrote. InputError: not measured.
+    """
+    found: list[Training] = []
+    for word in split_list(text, RUNS):
+        place = Path(word).expanduser()
+        if (place / f"{CLEAN}.json").is_file():
+            found.append(Training(place.name, levels_of(place)))
+            continue
+        for named in open_counts(word, runs_dir, split):
+            place = named.path.parent / EVALUATIONS / ROBUSTNESS / named.counts.split
+            found.append(Training(named.label, levels_of(place)))
+    return found
+
+
+def levels_of(folder: Path) -> tuple[Evaluation, ...]:
+    """Every level in a folder: clean first, then what has no severity, then by title."""
+    found = [level_of(path.with_suffix(".npz")) for path in sorted(folder.glob("*.json"))]
+    if CLEAN not in {level.row for level in found}:
+        raise InputError(f"{folder} has no counts of clean images; rgbt robustness makes them.")
+    order = sorted(found, key=lambda at: (at.unit != "", at.title, at.row, at.severity))
+    return tuple(sorted(order, key=lambda at: at.row != CLEAN))

@@ -12,15 +12,23 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from annotated_types import Interval
 
-from analysis.arguments import MOST, Blocks, Level, check_out, dataset_of
-from analysis.bar import progress
+from analysis.commands import (
+    MOST,
+    DrawOptions,
+    Regions,
+    check_out,
+    dataset_of,
+    progress,
+    text_table,
+    write_files,
+)
 from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.common_options import PredictionFormatOptions, RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics import names
-from rgbt.metrics.metric import MAX_REGIONS, Absent
+from rgbt.metrics.metric import Absent
 
 if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
     import pandas as pd
@@ -40,34 +48,13 @@ COLUMNS = (
 SHOWN = (names.MIOU, names.MACC, names.VAR)
 """Means in the tables; the file of scores holds more."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class FolderOptions(PredictionFormatOptions):
-    """Options of how a folder is counted; they have no effect on counts of runs."""
-
-    partition: Annotated[
-        Literal["all", "ring", "vertical", "horizontal"], Help("partition of the images")
-    ] = "all"
-    regions: Annotated[
-        int, Interval(ge=1, le=MAX_REGIONS), Help("number of regions of equal area")
-    ] = 5
-    missing: Annotated[
-        Literal["refuse", "leave_out"],
-        Help("images without a prediction: refuse, or leave_out: exclude them"),
-    ] = "refuse"
-    resize: Annotated[
-        Literal["refuse", "nearest", "stretch"],
-        Help(
-            "predictions of another size than their label: refuse; nearest: resize them by the "
-            "nearest pixel; stretch: so too where the ratio of height and width differs"
-        ),
-    ] = "refuse"
-    name: Annotated[str, Help("name of the method in tables; default: name of the folder")] = ""
+OF_PREDICTIONS = ("regions", "resize", "name", "format", "palette", "prefix", "suffix")
+"""Options that have no effect on counts of runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(FolderOptions):
-    """Options of ``rgbt score``; those of `FolderOptions` are for predictions only."""
+class Options(PredictionFormatOptions, DrawOptions):
+    """Options of ``rgbt score``."""
 
     predictions: Annotated[
         str,
@@ -84,6 +71,15 @@ class Options(FolderOptions):
         ),
     ] = ""
     split: Annotated[str, Help("split of the data set; default: test")] = ""
+    regions: Regions = 5
+    resize: Annotated[
+        Literal["refuse", "nearest", "stretch"],
+        Help(
+            "predictions of another size than their label: refuse; nearest: resize them by the "
+            "nearest pixel; stretch: so too where the ratio of height and width differs"
+        ),
+    ] = "refuse"
+    name: Annotated[str, Help("name of the method in tables; default: name of the folder")] = ""
     out: Annotated[
         Path | None,
         Help(
@@ -95,8 +91,6 @@ class Options(FolderOptions):
     resamples: Annotated[
         int, Interval(ge=0, le=MOST), Help("resamples for the intervals over images; 0: none")
     ] = 10_000
-    level: Level = 0.95
-    blocks: Blocks = "auto"
 
     @property
     def source(self) -> str:
@@ -114,19 +108,12 @@ def main(options: Options, overrides: list[str]) -> int:
     import pandas as pd
     from rich.console import Group
 
-    from analysis.tables import tidy_csv
-    from analysis.uncertainty import Resampling
-    from rgbt.files.atomic import write_atomic
-    from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
+    from rgbt.terminal import plain_text, print_rich, rich_table
 
     if bool(options.predictions) == bool(options.counts):
         raise InputError("predictions: expected either predictions=folder or counts=run.")
-    out, settings = options.out, None
+    out, settings = options.out, options.settings() if options.resamples else None
     _make_room(out, options.source)
-    if options.resamples:
-        settings = Resampling(
-            resamples=options.resamples, level=options.level, blocks=options.blocks
-        )
     if options.counts:
         counted, remarks = _stored_counts(options, overrides), []
     else:
@@ -140,19 +127,14 @@ def main(options: Options, overrides: list[str]) -> int:
             frame = scores(name, counts)
             said = add_intervals(frame, counts, settings) if settings else ""
             frames.append(frame)
-            tables.append(score_tables(frame, counts, said))
+            tables += score_tables(frame, counts, said)
             advance()
-    for each in tables:
-        print_rich(Group(*map(rich_table, each)))
+    print_rich(Group(*map(rich_table, tables)))
     print_rich(plain_text("\n".join(remarks)))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        title = "# Scores of " + ", ".join(dict.fromkeys(name for name, _ in counted))
-        texts = (grid.to_markdown() for each in tables for grid in each)
-        write_atomic(out / "scores.md", "\n".join([title, "", *texts, *remarks, ""]).encode())
-        write_atomic(out / "scores.csv", tidy_csv(pd.concat(frames)).encode())
-        write_atomic(out / SOURCE, f"{options.source}\n".encode())
-        print_rich(path_lines([("tables", str(out / "scores.md")), ("counts, scores", f"{out}/")]))
+    title = "# Scores of " + ", ".join(dict.fromkeys(name for name, _ in counted))
+    lines = [title, "", *(each.to_markdown() for each in tables), *remarks, ""]
+    texts = {"scores.md": "\n".join(lines), SOURCE: f"{options.source}\n"}
+    write_files(out, {**texts, "scores.csv": pd.concat(frames)})
     return 0
 
 
@@ -195,11 +177,11 @@ def add_intervals(frame: pd.DataFrame, counts: Counts, settings: Resampling) -> 
         for index, name in metrics.items():
             if (interval := found[name].images) is not None:
                 frame.loc[index, ["low", "high"]] = interval.low, interval.high
-    main = found[names.MIOU]
+    evidence = found[names.MIOU].evidence
     return (
         f"In brackets: {100 * settings.level:g} % intervals over images (Student, of Var without "
-        f"its bias), {settings.resamples} resamples of {main.said}; none where there are too few. "
-        f"{main.reason}"
+        f"its bias), {settings.resamples} resamples of {evidence.said}; none where there are too "
+        f"few. {evidence.reason}"
     ).strip()
 
 
@@ -210,7 +192,6 @@ def score_tables(frame: pd.DataFrame, counts: Counts, said: str = "") -> list[Te
     """
     import pandas as pd
 
-    from analysis.tables import text_table
     from rgbt.tables import class_labels, number
 
     shown = conventions(frame, counts)
@@ -255,8 +236,8 @@ def _about_absent(frame: pd.DataFrame, counts: Counts) -> str:
     absent = ", ".join(name for name in counts.classes if name in gone) or "no class"
     same = "" if len(conventions(frame, counts)) > 1 else "; the means agree"
     return (
-        f"Without a pixel to count in some region or part: {absent}. released counts that as 0, "
-        f"exclude leaves the class out of the mean{same}. The data set counts {counts.absent}."
+        f"Without a pixel in some region or part: {absent}. released: it counts as 0; exclude: it "
+        f"is left out of means{same}. The convention of the data set is absent={counts.absent}."
     )
 
 
@@ -279,16 +260,14 @@ def _make_room(out: Path | None, source: str) -> None:
 
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
-    from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
+    from analysis.predictions.scoring import ScoringOptions, score_folder
     from rgbt.data.predictions import Affixes, FormatOptions
 
     dataset = dataset_of(overrides)
     affixes = Affixes(options.prefix, options.suffix)
     counting = ScoringOptions(
-        partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
         regions=options.regions,
         format=FormatOptions(form=options.format, palette=options.palette, affixes=affixes),
-        missing=options.missing,
         resize=options.resize,
         name=options.name,
         absent=built("metric", overrides).absent,
@@ -301,8 +280,8 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
 def _stored_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
 
-    default = FolderOptions()
-    idle = [key for key, value in vars(default).items() if getattr(options, key) != value]
+    default = Options()
+    idle = [key for key in OF_PREDICTIONS if getattr(options, key) != getattr(default, key)]
     idle += [word.partition("=")[0] for word in overrides]
     if idle:
         raise InputError(f"'{idle[0]}' has no effect on stored counts.")

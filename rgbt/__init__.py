@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "load_run", "results"]
 
-# As the commands, by name: nothing in rgbt imports the analysis.
+# Named, not imported, as the commands are: nothing in rgbt imports the analysis.
 _MODULES = {"Run": "rgbt.api", "load_run": "rgbt.api", "results": "analysis.results"}
 
 

@@ -28,8 +28,8 @@ from rgbt.runs.result import RunResult
 from rgbt.runs.specify import load_spec
 from rgbt.types import Batch, View
 
+# An image as an array, or the path of its file.
 Image = NDArray[Any] | Path | str
-"""An image as an array, or the path of its file."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -41,7 +41,7 @@ class AveragedNetwork(AveragedModel):
 
     @torch.no_grad()
     def _average(self, means: Tensors, values: Tensors, count: object) -> None:
-        """Of tensors of one device and dtype; the count of torch is not used."""
+        """Average tensors of one device and dtype; the count of torch is not used."""
         del count
         if self._share < 1 and means[0].is_floating_point():
             torch._foreach_lerp_(means, values, self._share)

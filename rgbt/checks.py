@@ -32,8 +32,14 @@ def one_line(text: object) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """The names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm"."""
+    """The names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm".
+
+    Of more than thirty names: "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 71 names".
+    """
     names = sorted(known)
+    if len(names) > 30:
+        first, second, third = difflib.get_close_matches(word, names, n=3, cutoff=0)
+        return f"did you mean '{first}', '{second}' or '{third}'? known: {len(names)} names"
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     return "".join(f"did you mean '{each}'? " for each in close) + f"known: {', '.join(names)}"
 

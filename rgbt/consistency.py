@@ -20,12 +20,12 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from rgbt.evaluation.prediction import EvaluationData
 
-OF_PREDICTIONS = ("pairs", "format", "palette", "prefix", "suffix")
-OF_A_NETWORK = ("run", "exported", "runs_dir", "checkpoint", "modality", "trust")
+PREDICTION_OPTIONS = ("pairs", "format", "palette", "prefix", "suffix")
+NETWORK_OPTIONS = ("run", "exported", "runs_dir", "checkpoint", "modality", "trust")
 WITHOUT_EFFECT = {
-    "run": OF_PREDICTIONS,
-    "predictions": OF_A_NETWORK,
-    "export": (*OF_A_NETWORK, *OF_PREDICTIONS, "predictions", "out", "flow", "least_used"),
+    "run": PREDICTION_OPTIONS,
+    "predictions": NETWORK_OPTIONS,
+    "export": (*NETWORK_OPTIONS, *PREDICTION_OPTIONS, "predictions", "out", "flow", "least_used"),
 }
 
 

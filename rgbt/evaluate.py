@@ -24,8 +24,8 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.details import WIDTH
 
+# Value of `modality`: each view of the network.
 ALL = "all"
-"""Value of `modality`: each view of the network."""
 
 
 @dataclass(frozen=True)

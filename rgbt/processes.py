@@ -124,7 +124,7 @@ def collected(value: Value) -> list[Value]:
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Within it, this process works as if it were the only one, while the others wait."""
+    """A context in which this process works as if it were the only one; the others wait."""
     global _alone
     before, _alone = _alone, True
     try:

@@ -17,8 +17,8 @@ from rgbt.ranges import BatchSize, Pixels
 if TYPE_CHECKING:
     from rgbt.evaluation.profiled_network import ProfiledNetwork
 
+# Settings that change the network, its images, or the device.
 HEEDS = ("model", "scale", "experiment", "dataset", "domains", "recipe", "trainer", "debug")
-"""Settings that change the network, its images, or the device."""
 
 Rounds = Annotated[int, Interval(ge=1, le=100_000)]
 

@@ -10,33 +10,33 @@ from typing import Annotated, TypeVar
 
 from annotated_types import Interval, Len, Predicate, doc
 
+# A name, a path or a pattern that is not empty: "" would mean the current folder.
 Text = Annotated[str, Len(1, 4096), Predicate(str.isprintable), doc("printable characters")]
-"""A name, a path or a pattern that is not empty: "" would mean the current folder."""
 
+# A share of something, or a probability.
 Share = Annotated[float, Interval(ge=0, le=1)]
-"""A share of something, or a probability."""
 
+# A share below 1: a dropout rate, a momentum.
 ShareBelowOne = Annotated[float, Interval(ge=0, lt=1)]
-"""A share below 1: a dropout rate, a momentum."""
 
+# A weight or a factor; 0 disables the term.
 NonNegative = Annotated[float, Interval(ge=0, le=1e6)]
-"""A weight or a factor; 0 disables the term."""
 
+# A factor, a norm or a length that cannot be 0.
 Positive = Annotated[float, Interval(gt=0, le=1e6)]
-"""A factor, a norm or a length that cannot be 0."""
 
+# Exponent of a schedule.
 Power = Annotated[float, Interval(ge=0, le=100)]
-"""Exponent of a schedule."""
 
 LearningRate = Annotated[float, Interval(gt=0, le=1000)]
 
+# A constant added to a denominator.
 Epsilon = Annotated[float, Interval(ge=1e-12, le=1)]
-"""A constant added to a denominator."""
 
 GreyLevel = Annotated[float, Interval(ge=0, le=255)]
 
+# A seed of generators; 0 is valid.
 Seed = Annotated[int, Interval(ge=0, lt=2**32)]
-"""A seed of generators; 0 is valid."""
 
 NumSteps = Annotated[int, Interval(ge=1, le=10**8), doc("more steps would take years")]
 NumStepsOrZero = Annotated[int, Interval(ge=0, le=10**8), doc("more steps would take years")]
@@ -45,14 +45,14 @@ Workers = Annotated[int, Interval(ge=0, le=1024), doc("processes on one machine"
 Threads = Annotated[int, Interval(ge=1, le=1024), doc("threads of one process")]
 NumDevices = Annotated[int, Interval(ge=1, le=1024), doc("devices of one machine")]
 
+# Side of an image or of a part of it.
 Pixels = Annotated[int, Interval(ge=1, le=8192), doc("pixels")]
-"""Side of an image or of a part of it."""
 
+# Side lengths from which one is drawn.
 Lengths = Annotated[tuple[Pixels, ...], Len(1, 1000)]
-"""Side lengths from which one is drawn."""
 
+# Height and width.
 Size = tuple[Pixels, Pixels]
-"""Height and width."""
 
 Channels = Annotated[int, Interval(ge=1, le=8192), doc("channels")]
 
@@ -60,21 +60,21 @@ BaseWidth = Annotated[int, Interval(ge=1, le=1024), doc("channels; deep layers h
 
 Blocks = Annotated[int, Interval(ge=1, le=1000), doc("layers")]
 
+# Channels, or heads, of four stages.
 Widths = tuple[Channels, Channels, Channels, Channels]
-"""Channels, or heads, of four stages."""
 
+# Blocks of four stages.
 Depths = tuple[Blocks, Blocks, Blocks, Blocks]
-"""Blocks of four stages."""
 
+# Width of a block's feed-forward network divided by the width of the block.
 MlpRatio = Annotated[float, Interval(ge=1, le=64)]
-"""Width of a block's feed-forward network divided by the width of the block."""
 
 Names = tuple[Text, ...]
 
 Byte = Annotated[int, Interval(ge=0, le=255)]
 
+# Red, green, blue.
 Colour = tuple[Byte, Byte, Byte]
-"""Red, green, blue."""
 
 NumClasses = Annotated[
     int, Interval(ge=1, le=255), doc("labels are bytes, of which 255 is ignored")
@@ -91,5 +91,5 @@ def rising(ends: tuple[float, ...]) -> bool:
     return all(a <= b for a, b in zip(ends, ends[1:], strict=False))
 
 
+# Two ends of a range.
 Rising = Annotated[tuple[Number, Number], Predicate(rising), doc("the smaller one first")]
-"""Two ends of a range."""

@@ -134,11 +134,11 @@ class Record:
         return {**vars(self), **self.others}.get(key, False)
 
 
+# The record of a component that does not declare one.
 PLAIN = Record()
-"""The record of a component that does not declare one."""
 
+# Records by node for undeclared components that are not `PLAIN`: a loss reads class scores.
 WITHOUT_RECORD = {"loss": Record(requires=(Requirement("model", "outputs", "scores"),))}
-"""The same, by node, of components that are no `PLAIN` ones: a loss reads class scores."""
 
 
 def record_of(component: object, default: Record = PLAIN) -> Record:

@@ -19,17 +19,17 @@ from pydantic import BeforeValidator, TypeAdapter
 from rgbt.checks import without_controls
 from rgbt.metrics.names import DAY, NIGHT
 
+# Text of an undefined score, e.g. the IoU of a class that occurs nowhere.
 ABSENT = "-"
-"""Shown for an undefined score, e.g. the IoU of a class that occurs nowhere."""
 
+# Cells of text: words, and names longer than a key or a number.
 LABEL = re.compile(r"[^\W\d_]{3}.* |.{32}")
-"""Cells of text: words, and names longer than a key or a number."""
 
+# Beginning of a cell that a spreadsheet may execute, also behind apostrophes.
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
-"""Beginning of a cell that a spreadsheet may execute, also behind apostrophes."""
 
+# A fraction; NaN, where undefined, is None in files.
 Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
-"""A fraction; NaN, where undefined, is None in files."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class ConsistencyTable:
     mean_tc: Mapping[str, Score]
     mean_ca: Mapping[str, Score]
     unscored: tuple[str, ...] = ()  # classes that are left out of the means
+    notes: tuple[str, ...] = ()  # how classes without a pixel count
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
         columns.append((*table.ca[protocol], table.mean_ca[protocol]))
     labels = (*class_labels(table.names, table.unscored), "mean")
     rows = [(name, *map(percent, row)) for name, *row in zip(labels, *columns, strict=True)]
-    return TextTable(title, tuple(header), tuple(rows))
+    return TextTable(title, tuple(header), tuple(rows), table.notes)
 
 
 def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:

@@ -15,11 +15,11 @@ from rich.text import Text
 from rgbt.checks import without_controls
 from rgbt.tables import LABEL, ResultTables, TextTable, result_grids
 
+# Number of columns where stdout is no terminal: a file takes lines of any length.
 WIDTH = 10_000
-"""Columns where stdout is no terminal: a file takes lines of any length."""
 
+# Smallest width of a broken label; a key takes 12 columns and stays whole.
 SHORTEST = 16
-"""Least columns of a broken label; a key takes 12 and stays whole."""
 
 
 def info(sentence: str) -> None:
@@ -67,6 +67,6 @@ def rich_table(grid: TextTable) -> RenderableType:
         table.add_column(plain_text(name), justify=side, overflow="fold", min_width=least)
     for row in grid.rows:
         table.add_row(*map(plain_text, row))
-    # Not the table's own title, which it would break at its own width.
+    # The table's own title would be broken at the width of the table.
     title = [plain_text(grid.title, "bold")] if grid.title else []
     return Group(*title, table, *(plain_text(f" {note}", "dim") for note in grid.notes))

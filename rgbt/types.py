@@ -22,13 +22,13 @@ if TYPE_CHECKING:  # commands that show results import these types without NumPy
 
 IGNORE = 255
 
+# Input images of a prediction: both, or one alone.
 View = Literal["rgbt", "rgb", "thermal"]
-"""Input images of a prediction: both, or one alone."""
 
 VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
+# purpose -> generator; the same purpose in the same step always gives the same draws.
 GeneratorOf: TypeAlias = "Callable[[str], torch.Generator]"
-"""purpose -> generator; the same purpose in the same step always gives the same draws."""
 
 
 @dataclass(frozen=True)

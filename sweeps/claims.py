@@ -45,16 +45,16 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.terminal import path_lines, print_rich, rich_table
     from sweeps.rendering.claims import (
         claim_grids,
-        claims_csv,
         claims_frame,
         claims_markdown,
         counted,
         counts_grid,
+        frame_csv,
     )
 
     frame = claims_frame(judge_all(options, overrides))
     run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
-    print_rich(Group(*map(rich_table, [*claim_grids(frame, narrow=True), counts_grid(frame)])))
+    print_rich(Group(*map(rich_table, [*claim_grids(frame, noted=True), counts_grid(frame)])))
     print_rich(f"{counted(frame)} ({run_as})")
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def main(options: Options, overrides: list[str]) -> int:
         head = f"# Claims of the papers\n\n{counted(frame)} Runs: `{words}`."
         text = f"{head}\n\n{claims_markdown(frame)}"
         write_atomic(options.out / "claims.md", text.encode())
-        write_atomic(options.out / "claims.csv", claims_csv(frame).encode())
+        write_atomic(options.out / "claims.csv", frame_csv(frame).encode())
         print_rich(path_lines([("claims", str(options.out / "claims.md"))]))
     return 0
 
@@ -73,20 +73,18 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.progress import track
 
     from analysis.results import finished_runs
-    from sweeps.table.efficiency import exact_sizes
     from sweeps.table.load_table import is_own, table_names
     from sweeps.table.request import TableRequest
     from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
-    from sweeps.verdicts.effects import judged_claims
-    from sweeps.verdicts.judge import StoredRuns, TableJudge, rule_of
-    from sweeps.verdicts.stored import FinishedRuns, stored_runs
+    from sweeps.verdicts.stored import FinishedRuns, TableResults
     from sweeps.worker.planner import Planner
 
     names = table_names(Path("none")) if options.table == ALL else [options.table]
     finished = FinishedRuns(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
-    planner, stored = Planner(readable_paths([f"runs_dir={options.runs_dir}"])), StoredRuns()
+    planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
+    source = TableResults(finished, planner, counted=True)
     judged: list[JudgedClaim] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(each)
@@ -102,12 +100,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
             )
         if overrides or is_own(each):  # a test checks the others
             check_equal_runs(request, planner)
-        runs = stored_runs(request, finished, planner, checked=bool(overrides))
-        found = [result for run in runs.values() for result in run.results]
-        sizes = exact_sizes(request)
-        judged += judged_claims(
-            TableJudge(name, table, rule_of(found), sizes=sizes, stored=stored), runs
-        )
+        judged += source.result(request, checked=bool(overrides)).claims
     return judged
 
 

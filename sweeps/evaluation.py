@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
-from rgbt.metrics.details import OF_SCENES, DetailKind
+from rgbt.metrics.details import SCENE_KINDS, DetailKind
 from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
@@ -58,7 +58,7 @@ class ExtraEvaluation:
         """
         if self.frames is not None:
             return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
-        details = "all" if self.details in OF_SCENES else "boundary,calibration"
+        details = "all" if self.details in SCENE_KINDS else "boundary,calibration"
         given = {
             "head": None if self.head == "as trained" else self.head,
             "corruption": self.corruption,

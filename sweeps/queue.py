@@ -88,7 +88,7 @@ class Queue:
         rows = {p.overrides: set(p.tags[TAG + request.name].split(" | ")) for p in missing}
         sizes = {column.name for column in table.columns if column.efficiency is not None}
         for claim in (each for each in table.claims if not sizes & set(each.columns)):
-            named = {row for each in contrasts_of(claim, table) for row in each.rows}
+            named = {cell.row for each in contrasts_of(claim, table) for cell in each.cells}
             needed = [each for each, labels in rows.items() if labels & named or not named]
             is_open = judged.get(claim.name) not in ("holds", "contradicted")
             self.claims += 1

@@ -82,8 +82,7 @@ def main(options: Options, overrides: list[str]) -> int:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
     from sweeps.queue import run_queue
-    from sweeps.rendering.preview import print_preview
-    from sweeps.rendering.publish import publish_table
+    from sweeps.rendering.publish import print_preview, publish_table
     from sweeps.table_plan import plan_table, stored_and_planner
     from sweeps.verdicts.judge import rule_of
     from sweeps.worker.point_list import preview_points, run_points

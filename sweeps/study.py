@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -249,8 +250,10 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
     print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
-    command = f"optuna-dashboard {without_passwords(url)}"
-    print_rich(path_lines([("report", str(out / "study.md")), ("figures", command)]))
+    lines = [("report", str(out / "study.md"))]
+    if find_spec("optuna_dashboard"):
+        lines.append(("figures", f"optuna-dashboard {without_passwords(url)}"))
+    print_rich(path_lines(lines))
 
 
 def study_folder(runs_dir: Path, name: str) -> Path:

@@ -17,12 +17,11 @@ from rgbt.config.options import readable_paths
 from sweeps.point import Outcome
 from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import PREVIOUS
-from sweeps.table.efficiency import exact_sizes
+from sweeps.table.efficiency import network_sizes
 from sweeps.table.external import ExternalRow, ExternalRun, external_rows, row_named
 from sweeps.table.load_table import PUBLISHED, is_own, load_table, table_names, table_path
 from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
 from sweeps.table.table import Row, Table
-from sweeps.verdicts.forms import both_forms
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from sweeps.worker.planner import Planner
@@ -127,7 +126,7 @@ def make_request(
     """
     check_choice("scale", request.scale, available("scale"))
     table = select_rows(request.table, rows) if rows else request.table
-    table = both_forms(table) if both else table
+    table = table.both_forms() if both else table
     external, others = external_rows(request.extra, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
     typed = [f"{row.kind}.{row.label}={row.path}" for row in external]
@@ -209,10 +208,10 @@ def plan_table(
         check_equal_runs(request, planner)
     if adds and not request.table.claims:
         raise InputError(
-            f"seeds=until_decided: {name} has no claims with these rows (and none with "
-            "form=both); give a number of seeds, or add claims to the table."
+            f"seeds=until_decided: {name} has no claims with these rows; give a number of seeds, "
+            "or add claims to the table."
         )
-    sizes = {} if options.dry_run else exact_sizes(request)
+    sizes = {} if options.dry_run else network_sizes(request)
     judge = TableJudge(name, request.table, AnyTime() if adds else FixedSeeds(), sizes=sizes)
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
+import hashlib
 import os
 import re
 import signal
@@ -13,6 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -20,6 +23,7 @@ import numpy as np
 import pytest
 
 from rgbt.randomness import numpy_generator
+from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import WORDS
 from tests.commands import SPLITS, Call, Trained, without_pictures, words_of
 
@@ -48,10 +52,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True)
 def modules_of_the_reader() -> Iterator[None]:
-    """Forget the reader's module `my_lab`: every test has its own."""
-    sys.modules.pop("my_lab", None)
+    """Forget the reader's modules `my_lab`: every test has its own."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+        del sys.modules[name]
     yield
-    sys.modules.pop("my_lab", None)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+        del sys.modules[name]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -154,30 +160,51 @@ def data(write_mfnet: Callable[..., Path]) -> Path:
     return write_mfnet(SPLITS, hw=(48, 64))
 
 
+@pytest.fixture(scope="module")
+def composed_once() -> Iterator[None]:
+    """The runs of rows are composed once for a module, whatever folder they are in."""
+    from sweeps.worker import planner
+
+    once = cache(planner.specify_run)
+
+    def specify(words: tuple[str, ...], *, checked: bool = True) -> RunSpec:
+        return once(tuple(w for w in words if not w.startswith("runs_dir=")), checked=checked)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "specify_run", specify)
+        yield
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """The folder of a run with these overrides, trained once in a session; to be read or copied.
+    """The folder of a run with these overrides, to be read or copied.
 
-    Runs on a data set that the overrides name share a folder of runs, and their upstream runs.
+    Trained once in a call of pytest, whose processes share it. Runs on a data set that the
+    overrides name share a folder of runs, and their upstream runs.
     """
     from rgbt.run import main
     from tests.composed import specified
 
-    made: dict[tuple[str, ...], Path] = {}
-    shared = tmp_path_factory.mktemp("shared")
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
 
     def run(*overrides: str) -> Path:
-        if overrides not in made:
-            names_data = any(word.startswith("dataset=") for word in overrides)
-            place = shared if names_data else tmp_path_factory.mktemp("trained")
-            data = place / "mf" if names_data else write_data(place / "mf", SPLITS, (48, 64))
-            words = words_of(data, place / "runs", *overrides)
-            with pytest.MonkeyPatch.context() as patch, without_pictures():
-                patch.setattr(sys, "argv", ["rgbt", *words])
-                with pytest.raises(SystemExit) as left:
-                    main()
-            assert not left.value.code
-            made[overrides] = specified(tuple(words)).folder
-        return made[overrides]
+        names_data = any(word.startswith("dataset=") for word in overrides)
+        digest = hashlib.sha256(repr(overrides).encode()).hexdigest()[:12]
+        place = shared / ("synthetic" if names_data else digest)
+        place.mkdir(parents=True, exist_ok=True)
+        words = words_of(place / "mf", place / "runs", *overrides)
+        folder = specified(tuple(words)).folder
+        with (place / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until it is closed
+            if not (folder / "result.json").exists():
+                if not names_data:
+                    write_data(place / "mf", SPLITS, (48, 64))
+                with pytest.MonkeyPatch.context() as patch, without_pictures():
+                    patch.setattr(sys, "argv", ["rgbt", *words])
+                    with pytest.raises(SystemExit) as left:
+                        main()
+                assert not left.value.code
+        return folder
 
     return run

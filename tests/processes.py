@@ -65,7 +65,7 @@ def _run(
     try:
         os.environ["GLOO_SOCKET_IFNAME"] = "lo"
         torch.set_num_threads(1)
-        store, limit = TCPStore(HOST, port, is_master=False), timedelta(seconds=60)
+        store, limit = TCPStore(HOST, port, is_master=False), timedelta(seconds=300)
         distributed.init_process_group(
             "gloo", store=store, rank=rank, world_size=size, timeout=limit
         )

@@ -93,27 +93,6 @@ def test_load_run_gives_probabilities_and_scores(run: rgbt.Run) -> None:
     assert {f"test/{name}": s for name, s in run.scores().items()} == pytest.approx(recorded)
 
 
-@pytest.mark.parametrize(
-    ("act", "said"),
-    [
-        (lambda run: run.predict(RGB / 255, THERMAL), "rgb"),
-        (lambda run: run.predict(RGB, THERMAL[:9]), r"thermal of shape .* uint8 \(9, 64\)"),
-        (lambda run: run.predict(RGB, THERMAL.astype(np.uint16)), "8 bits"),
-        (lambda run: run.predict(RGB, "thermal.png"), "got uint8 .* and <U11"),
-        (lambda run: run.predict(RGB, THERMAL, modality="depth"), "modality: 'depth'"),
-        (lambda run: run.predict(RGB, THERMAL, head="day"), "head: 'day'"),
-        (lambda run: run.counts("tset"), "no counts of the split 'tset'; .*rgbt evaluate run=/"),
-        (lambda run: rgbt.load_run("none", runs_dir=run.folder), "run=none"),
-        (lambda run: rgbt.load_run(run.folder, checkpoint="first"), "checkpoint: 'first'"),
-        (lambda run: rgbt.load_run(run.folder, "data.cache=auto"), "list of overrides"),
-        (lambda run: rgbt.load_run(run.folder, ["model=mfnet"]), "'model'"),
-    ],
-)
-def test_bad_input_names_the_argument(run: rgbt.Run, act: Any, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        act(run)
-
-
 def test_own_classes_are_refused_until_their_module_is_trusted(
     run: rgbt.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

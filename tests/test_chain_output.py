@@ -32,7 +32,7 @@ def value_of(row: str, out: str) -> float:
     return float(line.split()[-1])
 
 
-def test_day_night_run_shows_the_mean_and_the_other_head(call: Call, tmp_path: Path) -> None:
+def test_day_night_run_shows_mean_and_other_head(call: Call, tmp_path: Path) -> None:
     """Of two stages; the first one needs no teacher."""
     words = [
         *("+experiment=multi_head_night", "+debug=smoke", "dataset=freiburg", "tracking=none"),

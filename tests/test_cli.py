@@ -77,22 +77,3 @@ def test_exit_code_of_an_error() -> None:
     assert exit_code(lambda: fail(InputError("wrong"))) == 2
     assert exit_code(lambda: fail(RunError("diverged"))) == 1
     assert exit_code(lambda: fail(KeyboardInterrupt())) == 130
-
-
-@pytest.mark.slow
-def test_trials_of_the_console_script_are_not_shadowed(tmp_path: Path) -> None:
-    """In a folder that holds packages of the user's called as ours, and a masker of the user's."""
-    for name in ("sweeps", "analysis", "site"):
-        (tmp_path / name).mkdir()
-    for name in ("sweeps", "analysis"):
-        (tmp_path / name / "__init__.py").touch()
-    text = "from rgbt.maskers.masker import Masker\nclass Mine(Masker):\n    pass\n"
-    (tmp_path / "my_masks.py").write_text(text)
-    script = tmp_path / "site" / "rgbt"
-    script.write_text("from rgbt.__main__ import main\nif __name__ == '__main__':\n    main()\n")
-    settings = ("max_steps=1", "eval_every=1", "accelerator=cpu", "threads=1")
-    grid = ("-m", "+experiment=grbm", "seed=0,1", "tracking=none", "masker._target_=my_masks.Mine")
-    words = (*grid, *(f"trainer.{each}" for each in settings))
-    right = python(tmp_path, str(script), "run", *words)
-    assert right.returncode == 0, right.stdout + right.stderr
-    assert len(list(tmp_path.glob("runs/*/result.json"))) == 2

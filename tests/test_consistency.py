@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +104,7 @@ def test_run_measures_its_consistency(trained: Trained) -> None:
         assert table[score.lower()][protocol] == pytest.approx(by_class, abs=1e-12)
 
 
-def test_run_image_of_another_shape_does_not_cost_the_training(
+def test_image_of_another_shape_does_not_end_the_training(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
     name = SPLITS["test"][1]
@@ -202,7 +201,7 @@ def predicted(exported: Path, tmp_path: Path) -> Path:
     return tmp_path / "predicted"
 
 
-def test_export_writes_both_frames_of_every_pair_and_their_list(exported: Path, data: Path) -> None:
+def test_export_writes_frames_and_list_of_every_pair(exported: Path, data: Path) -> None:
     for name in (f"{name}{view}" for name in SPLITS["test"] for view in ("", "_view1", "_view3")):
         for kind, shape in (("rgb", (48, 64, 3)), ("thermal", (48, 64))):
             path = exported / kind / f"{name}.png"
@@ -226,64 +225,6 @@ def test_predictions_of_a_network_count_as_the_network_does(
     words = (f"predictions={written}", f"pairs={exported}", f"out={out}")
     measure(call, *words, "dataset=mfnet", f"dataset.root={data}")
     assert_same_counts(out, run / "evaluations")
-
-
-def small(path: Path) -> None:
-    assert cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
-
-
-def interrupt(data: Path, predicted: Path) -> None:
-    listed = {**read(predicted, "pairs.json"), "complete": False}
-    (predicted / "pairs.json").write_text(json.dumps(listed))
-
-
-def name_twice(data: Path, predicted: Path) -> None:
-    for folder in ("images", "labels"):
-        shutil.copy(data / folder / "00202N.png", data / folder / "00201D_view1.png")
-    (data / "test.txt").write_text("00201D\n00201D_view1\n")
-
-
-OF_METHOD, VIEW, LABEL = "predictions={tmp}/predicted", "00202N_view2.png", "labels/00201D.png"
-REFUSED: dict[str, tuple[tuple[str, ...], str, Callable[[Path, Path], None] | None]] = {
-    "sets": ((OF_METHOD, "consistency.sets=[released_1]"), "views: the pairs were exported", None),
-    "split": ((OF_METHOD, "split=val"), "split: the pairs were exported", None),
-    "list": ((OF_METHOD, "pairs={tmp}"), "pairs=FOLDER", None),
-    "run": ((OF_METHOD, "run=runs/1c0ffe"), "'run'", None),
-    "both": ((OF_METHOD, "export={tmp}/more"), "'predictions'", None),
-    "network": (("run=x", "pairs={tmp}"), "'pairs'", None),
-    "flow of views": ((OF_METHOD, "flow=rgb"), "flow=rgb", None),
-    "share of next": ((OF_METHOD, "frames=next", "least_used=0.5"), "'least_used'", None),
-    "other pairs": (("export={tmp}/pairs", "split=val"), "export=", None),
-    "other files": (("export={tmp}",), "export=", None),
-    "no prediction": ((OF_METHOD,), VIEW, lambda _, folder: (folder / VIEW).unlink()),
-    "small prediction": ((OF_METHOD,), VIEW, lambda _, folder: small(folder / VIEW)),
-    "other label": (
-        (OF_METHOD,),
-        "dataset: the pairs were exported",
-        lambda data, _: small(data / LABEL),
-    ),
-    "interrupted export": ((OF_METHOD,), "interrupted", interrupt),
-    "one name for two": ((OF_METHOD,), "00201D_view1", name_twice),
-}
-
-
-@pytest.mark.parametrize(("words", "named", "spoil"), REFUSED.values(), ids=REFUSED)
-def test_settings_and_files_that_do_not_fit_are_refused(
-    call: Call,
-    data: Path,
-    predicted: Path,
-    tmp_path: Path,
-    words: tuple[str, ...],
-    named: str,
-    spoil: Callable[[Path, Path], None] | None,
-) -> None:
-    if spoil is not None:
-        spoil(data, predicted)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
-    given = (word.format(tmp=tmp_path) for word in words)
-    refused(call, named, "dataset=mfnet", f"dataset.root={data}", *given)
-    after = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
-    assert after == before
 
 
 HW = (48, 64)

@@ -47,7 +47,7 @@ def test_recipe_has_the_classes_of_the_data_set(nodes: DictConfig, classes: int)
         counts = [each[key] for each in spaces for key in each if re.match(r"n(um)?_class", key)]
         assert counts == [classes], f"{name}: exactly one argument has the number of classes"
         adapter = adapter_of(values["constructor"])
-        pattern = r"[\w.]+:\w+" if adapter is None else rf"{name}\.py:network"
+        pattern = r"[\w.]+:\w+" if adapter is None else rf"adapters\.py:{name}"
         assert re.fullmatch(pattern, values["constructor"])
         assert set(values) == set(inspect.signature(ExternalNetwork).parameters)
         # A stacked tensor has four channels in all recipes; both images apart have three each.
@@ -64,4 +64,5 @@ def test_recipe_has_keys_that_differ_and_states_its_source(name: str) -> None:
     head = " ".join(line[2:] for line in text.splitlines() if line.startswith("# "))
     assert re.search(r"Repository: [\w.-]+/[\w.-]+ ", head)
     assert re.search(r"Commit: [0-9a-f]{8} \(20\d\d-\d\d-\d\d\)\. Licence: ", head)
+    assert re.search(r"Licence: .*?\. Lists: (trained on|not checked)", head)
     assert re.search(r"[\d,]{9,} parameters at (nine|five) classes", head)

@@ -6,7 +6,6 @@ import random
 from collections.abc import Iterator
 from typing import Any
 
-import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
@@ -68,8 +67,7 @@ def outcome(config: DictConfig, key: str, value: Any, *, is_senseless: bool) -> 
     return f"{key}={value!r:.30}: senseless value accepted" if is_senseless else "fine"
 
 
-@pytest.mark.parametrize("number", [200, pytest.param(1000, marks=pytest.mark.slow)])
-def test_no_senseless_value_passes_the_check(number: int) -> None:
+def test_no_senseless_value_passes_the_check() -> None:
     configs = [compose([f"+experiment={name}", "tracking=none"]) for name in EXPERIMENTS]
     cases = {
         (key, number): (config, usual, value)
@@ -80,7 +78,7 @@ def test_no_senseless_value_passes_the_check(number: int) -> None:
         for number, value in enumerate((*NEVER, *SOME))
     }
     wrong = []
-    for key, index in random.Random(17).sample([*cases], number):
+    for key, index in random.Random(17).sample([*cases], 200):
         config, usual, value = cases[key, index]
         senseless = must_be_refused(key, usual, value)
         wrong.append(outcome(config, key, value, is_senseless=senseless))

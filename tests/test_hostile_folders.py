@@ -91,7 +91,7 @@ def test_commands_on_a_hostile_folder_change_nothing_outside(
     assert state(victim) == before
 
 
-def test_a_hostile_run_is_left_out_of_the_runs_of_a_folder(
+def test_hostile_run_is_left_out_of_its_folder(
     hostile: Path, victim: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (hostile / "copy.npz").symlink_to(hostile / "counts_test.npz")
@@ -120,7 +120,7 @@ def test_files_read_alone_are_not_followed_out(tmp_path: Path, victim: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "result.json", "lock", "counts_val.npz"])
-def test_a_pipe_in_place_of_a_file_is_refused_at_once(hostile: Path, name: str) -> None:
+def test_pipe_in_place_of_file_is_refused_at_once(hostile: Path, name: str) -> None:
     (hostile / name).unlink(missing_ok=True)
     os.mkfifo(hostile / name)
     for use in (RunFolder, RunResult):

@@ -133,9 +133,9 @@ def check(bench: Bench, place: Path) -> None:
     assert steps == list(range(1, STEPS + 1))
 
 
-@pytest.mark.parametrize("series", range(10))
+@pytest.mark.parametrize("series", range(2))
 def test_killed_at_random_instants(bench: Bench, series: int) -> None:
-    """Six kills each, sixty in all; by the process or its whole group, with workers or without."""
+    """Six kills each; by the process or its whole group, with workers or without."""
     draw = random.Random(series)
     training = Training(bench.root / f"random_{series}", bench.executor, num_workers=series % 2)
     inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])
@@ -161,11 +161,8 @@ def test_killed_at_random_instants(bench: Bench, series: int) -> None:
 
 
 INSTANTS = (
-    *("before config.yaml 1", "after run.json 1", "after mlflow.json 1", "before mlflow.json 1"),
-    *("after dataset.json 1", "after provenance.json 1", "before metrics.jsonl 1"),
-    *("before counts_val.npz 1", "after counts_val.npz 1", "before best.pt 1", "after best.pt 1"),
-    *("before last.pt 2", "after last.pt 2", "before last.pt 6", "after counts_test.npz 1"),
-    *("before result.json 1", "after result.json 1"),
+    *("before config.yaml 1", "after run.json 1", "after mlflow.json 1", "before metrics.jsonl 1"),
+    *("after counts_val.npz 1", "before best.pt 1", "before last.pt 2", "before result.json 1"),
 )
 
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from rgbt import predict
-from rgbt.config.component import build
-from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import PseudoLabels
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
 
@@ -44,40 +40,6 @@ def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) ->
         assert confidence.dtype == np.uint16
         # The largest of nine probabilities is at least a ninth.
         assert confidence.min() >= 65535 // 9
-
-
-@pytest.mark.slow
-def test_a_network_of_other_classes_needs_a_label_map(
-    call: Call, data: Path, tmp_path: Path
-) -> None:
-    network = ("model=mfnet_tiny", "model.num_classes=14")
-    model = build(compose([*network, "dataset=mfnet", f"dataset.root={data}"]).model)
-    torch.save(model.state_dict(), tmp_path / "freiburg.pth")
-    named = (
-        *(*network, f"model.weights={tmp_path / 'freiburg.pth'}", f"dataset.root={data}"),
-        *(f"runs_dir={tmp_path}", "data.num_workers=0", "trainer.threads=1", "input=val"),
-        "trainer.accelerator=cpu",
-    )
-    out = tmp_path / "out"
-    said = {"pseudo_labels=true": "model.num_classes is 14"}
-    said["label_map=vistas_to_freiburg"] = "label_map maps 66 classes"
-    for word, sentence in said.items():
-        code, _, err = call(PREDICT, *named, f"out={out}", word)
-        assert code == 2
-        assert_one_sentence(err, sentence)
-
-    mapped = (*named, "label_map=freiburg_to_mfnet")
-    code, _, err = call(PREDICT, *mapped, f"out={out}", "pseudo_labels=true")
-    assert code == 0, err
-    manifest = json.loads((out / "pseudo_labels.json").read_text())
-    assert manifest["teacher"] == "freiburg.pth"
-    assert manifest["label_map"]["num_source"] == 14
-    code, _, err = call(PREDICT, *mapped, f"out={tmp_path / 'plain'}")
-    assert code == 0, err
-    for name in SPLITS["val"]:
-        label = image(out / "labels" / f"{name}.png")
-        assert set(np.unique(label)) <= {0, 1, 2, 3, 4}
-        assert np.array_equal(label, image(tmp_path / "plain" / f"{name}.png"))
 
 
 def with_missing(data: Path, folder: Path, missing: str) -> Path:

@@ -32,15 +32,15 @@ from tests.models.plain import generator
 from tests.processes import run_in_processes
 from tests.transforms.recipes import crm
 
-SIZES = pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.slow)])
+SIZE = 2
 B, DTYPES = 8, (torch.float32, torch.float32, torch.float64)
 SPLITS = {"train": [f"{i:05d}D" for i in range(11)], "val": [f"{i:05d}N" for i in range(5)]}
 
 
 @cache
-def of(size: int) -> list[dict[str, Any]]:
+def found_by_rank() -> list[dict[str, Any]]:
     """What each of the processes found, by rank."""
-    return run_in_processes(everything, size)
+    return run_in_processes(everything, SIZE)
 
 
 def everything() -> dict[str, Any]:
@@ -86,24 +86,23 @@ def averaged() -> list[float | None]:
     return [None if each.grad is None else float(each.grad[1]) for each in parameters]
 
 
-@SIZES
-def test_parts_wholes_and_sums(size: int) -> None:
+def test_parts_wholes_and_sums() -> None:
     entries = torch.arange(2 * B).view(B, 2)
-    ranks = sum(range(size))
-    total = torch.tensor([float(size), 2.0 * size + ranks])
-    for rank, found in enumerate(of(size)):
-        assert torch.equal(found["own"][0], entries[rank::size])
-        assert torch.equal(found["own"][1], entries[:, rank::size])
-        assert found["own_draw"].tolist() == list(range(rank, B, size))
+    ranks = sum(range(SIZE))
+    total = torch.tensor([float(SIZE), 2.0 * SIZE + ranks])
+    for rank, found in enumerate(found_by_rank()):
+        assert torch.equal(found["own"][0], entries[rank::SIZE])
+        assert torch.equal(found["own"][1], entries[:, rank::SIZE])
+        assert found["own_draw"].tolist() == list(range(rank, B, SIZE))
         assert all(found["whole"])
         # The gradient is of the sum of (rank + 1) * total^2 over all processes.
-        expected = (total, 2 * total * (ranks + size), torch.tensor(ranks))
+        expected = (total, 2 * total * (ranks + SIZE), torch.tensor(ranks))
         assert all(map(torch.equal, found["sums"], expected))
-        assert found["mean_count"] == 3 * ranks / size
+        assert found["mean_count"] == 3 * ranks / SIZE
         assert found["largest"] == 5
         # Of each parameter the mean of rank and of 10 rank; the one without a gradient has none.
-        assert found["averaged"] == [ranks / size, None, 10 * ranks / size]
-        assert found["objects"] == (0, [("of", other) for other in range(size)])
+        assert found["averaged"] == [ranks / SIZE, None, 10 * ranks / SIZE]
+        assert found["objects"] == (0, [("of", other) for other in range(SIZE)])
 
 
 def normalised() -> dict[str, Any]:
@@ -139,16 +138,15 @@ def normalised() -> dict[str, Any]:
     }
 
 
-@SIZES
-def test_batch_norm_is_that_of_one_process(size: int) -> None:
+def test_batch_norm_is_that_of_one_process() -> None:
     expected = normalised()
     close = partial(torch.testing.assert_close, rtol=1e-9, atol=1e-12)
-    for rank, found in enumerate(of(size)):
+    for rank, found in enumerate(found_by_rank()):
         for ours, every in zip(found["outputs"], expected["outputs"], strict=True):
-            close(ours, every[rank::size])
+            close(ours, every[rank::SIZE])
         close(found["gradients"], expected["gradients"])
         close(found["statistics"], expected["statistics"])
-        close(found["evaluated"], expected["evaluated"][rank::size])
+        close(found["evaluated"], expected["evaluated"][rank::SIZE])
         assert (found["replaced"], found["same"]) == (3, True)
         assert all(values == [1] for values in found["shared"])
     assert expected["replaced"] == 0
@@ -169,12 +167,12 @@ def renamed() -> None:
     synchronise_batch_norm(nn.Sequential(type("OfUser", (nn.BatchNorm2d,), {})(3)))
 
 
-def test_a_derived_normalisation_is_refused_where_there_are_several_processes() -> None:
-    assert of(2)[1]["subclass"]
+def test_derived_normalisation_is_refused_in_several_processes() -> None:
+    assert found_by_rank()[1]["subclass"]
     assert not is_refused(renamed)
 
 
-def test_batch_norm_parts_are_one_or_the_number_of_devices() -> None:
+def test_batch_norm_parts_are_one_or_number_of_devices() -> None:
     for parts, size in ((1, 1), (1, 4), (4, 4)):
         check_batch_norm_parts(parts, size)
     for parts, size in ((2, 1), (2, 4), (8, 4)):
@@ -193,17 +191,16 @@ def loaded(root: Path) -> dict[str, Any]:
     }
 
 
-@SIZES
-def test_each_process_loads_its_own_samples(write_mfnet: WriteMFNet, size: int) -> None:
+def test_each_process_loads_its_own_samples(write_mfnet: WriteMFNet) -> None:
     root = write_mfnet(SPLITS)
     expected = loaded(root)
-    found = run_in_processes(loaded, size, root)
+    found = run_in_processes(loaded, SIZE, root)
     for rank, ours in enumerate(found):
         for part, batch in zip(ours["train"], expected["train"], strict=True):
-            assert part.name == batch.name[rank::size]
-            assert torch.equal(part.rgb, batch.rgb[rank::size])
-            assert torch.equal(part.label, batch.label[rank::size])
-        assert ours["eval"] == expected["eval"][rank::size]
+            assert part.name == batch.name[rank::SIZE]
+            assert torch.equal(part.rgb, batch.rgb[rank::SIZE])
+            assert torch.equal(part.label, batch.label[rank::SIZE])
+        assert ours["eval"] == expected["eval"][rank::SIZE]
         assert ours["uneven"]
     names = [name for ours in found for batch in ours["eval"] for name in batch]
     assert sorted(names) == SPLITS["val"]  # each once, although one process may have none

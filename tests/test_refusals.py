@@ -29,12 +29,17 @@ from tests.conftest import write_data
 TEMPORAL = ("+experiment=temporal_con", "masker.patch_size=null")
 
 RUN = [
-    *(("+experiment=gbrm", "'grbm'"), ("optimizer.lrr=1", "'optimizer.lrr'")),
+    *(
+        ("+experiment=gbrm", "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 71"),
+        ("optimizer.lrr=1", "'optimizer.lrr'"),
+    ),
     *(("+loss.spatial.alfa=1", "'loss.spatial.alfa'"), ("+sead=1", "'sead'")),
     *(("optimizer.lr=fast", "'optimizer.lr'"), ("trainer.clip_norm=nan", "'trainer.clip_norm'")),
     *(("seed=[0,1]", "'seed'"), ("seeds=3", "'seeds'"), ("learning", "'learning'")),
     ("--experiment=grbm", "'--experiment=grbm' is not an option"),
     ("hydra.searchpath=[/no/where]", "the folder /no/where does not exist"),
+    ("trainer.accelerator=gpu", "'trainer.accelerator': write cuda"),
+    ("dataset.root=???", "docs/how-to/prepare-data-sets.md"),
     *(("trainer.accelerator=mps", "trainer.accelerator"), ("out=x.png", "out=x.png")),
     *(("model.num_classes=5", "num_classes is 5"), ("trainer.selection_split=vall", "'vall'")),
     *(
@@ -107,7 +112,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("text", "word"), ADAPTATION, ids=[text for text, _ in ADAPTATION])
-def test_run_on_two_domains_that_do_not_fit_is_one_sentence(
+def test_domains_that_do_not_fit_are_one_sentence(
     call: Call, drawn: Path, tmp_path: Path, text: str, word: str
 ) -> None:
     folder = tmp_path / "labels"
@@ -203,7 +208,7 @@ CASES = [(e, w, text, word) for e, (w, cases) in OF_A_RUN.items() for text, word
 
 
 @pytest.mark.parametrize(("entry", "words", "text", "word"), CASES, ids=[c[2] for c in CASES])
-def test_request_of_a_run_that_does_not_fit_is_one_sentence(
+def test_request_that_does_not_fit_is_one_sentence(
     call: Call,
     trained: Trained,
     tmp_path: Path,

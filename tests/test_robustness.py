@@ -52,7 +52,7 @@ def test_robustness_counts_are_those_of_evaluate(
     assert (folder / "evaluations" / "mfnet_test_rgbt_ring5_noise_rgb-16.npz").exists()
     # Over other regions beside them; twice the same run, of which nothing is made again.
     words = ("corruptions=removed:thermal", "regions=ring9", "runs_dir=" + str(tmp_path / "runs"))
-    code, out, err = call(ENTRY, "run=key,key", *words)
+    code, out, err = call(ENTRY, f"run={folder.name},{folder.name}", *words)
     assert code == 0, err
     assert out.count("thermal removed (zeroed)") == 2
     assert (place.with_name("test_ring9") / "thermal_removed-1.npz").exists()

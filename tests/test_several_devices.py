@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -120,32 +121,31 @@ def test_batch_that_three_processes_cannot_share_is_refused(
         assert out == err == ""
 
 
-EXPERIMENTS = {
-    "mfnet": ("optimizer.lr=1e-4", "trainer.averaging=ema", "trainer.ema_decay=0.9"),
-    "cmx": ("optimizer.lr=1e-5",),
-    "crm": ("optimizer.lr=1e-6",),
-    "multi_head_night": ("optimizer.lr=1e-5", "scale.critic_lr=1e-5", "model.weights=null"),
+EXPERIMENTS: dict[str, tuple[Any, ...]] = {
+    "mfnet": (2, "optimizer.lr=1e-4", "trainer.averaging=ema", "trainer.ema_decay=0.9"),
+    "crm": (4, "optimizer.lr=1e-6"),
+    "multi_head_night": (*(2, "optimizer.lr=1e-5", "scale.critic_lr=1e-5", "model.weights=null"),),
 }
-"""With rates at which a step changes the weights little, so that rounding stays."""
+"""Number of processes, and rates at which a step changes the weights little: rounding stays."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_any_number_of_processes_trains_the_same_run(tmp_path: Path, experiment: str) -> None:
+    number, *own = EXPERIMENTS[experiment]
     words = (
         *(f"+experiment={experiment}", "+debug=smoke", "scale.batch_size=4", "scale.num_points=64"),
-        *("trainer.max_steps=10", "trainer.eval_every=10", "data.num_workers=0", *ON_CPU),
+        *("trainer.max_steps=5", "trainer.eval_every=5", "data.num_workers=0", *ON_CPU),
         *("scale.crop_hw=[64,80]", "scale.train_sizes=[64]", "scale.test_short_edge=64"),
-        *EXPERIMENTS[experiment],
+        *own,
     )
     alone = Command(words, tmp_path / "1").finished()
-    for number in (2, 4):
-        several = Command((*words, f"trainer.devices={number}"), tmp_path / str(number))
-        folder = several.finished()
-        assert folder.name == alone.name
-        assert_same_run(folder, alone)
-        assert several.text.count(f"{number} x cpu, 1 thread each") == 1
-        assert several.text.count("IoU by region") == 1
+    several = Command((*words, f"trainer.devices={number}"), tmp_path / str(number))
+    folder = several.finished()
+    assert folder.name == alone.name
+    assert_same_run(folder, alone)
+    assert several.text.count(f"{number} x cpu, 1 thread each") == 1
+    assert several.text.count("IoU by region") == 1
 
 
 @pytest.fixture(scope="module")
@@ -159,11 +159,9 @@ def straight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("killed", "signal_", "code", "number"),
     [
-        ("process 0", signal.SIGKILL, 137, 1),
-        ("process 1", signal.SIGKILL, 137, 4),
+        ("process 1", signal.SIGKILL, 137, 1),
         ("command", signal.SIGKILL, -9, 2),
         ("command", signal.SIGTERM, 143, 1),
-        ("command", signal.SIGINT, 130, 2),
     ],
 )
 def test_killed_run_resumes_with_another_number(
@@ -176,7 +174,7 @@ def test_killed_run_resumes_with_another_number(
     assert len(members) == 2
     os.kill(first.process.pid if killed == "command" else members[int(killed[-1])].pid, signal_)
     assert first.wait() == code, first.text
-    assert not psutil.wait_procs(members, timeout=30)[1]
+    assert not psutil.wait_procs(members, timeout=120)[1]
     if killed != "command":
         assert_one_sentence(first.text, f"{killed} of 2 was stopped by SIGKILL")
     elif signal_ != signal.SIGKILL:

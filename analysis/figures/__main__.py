@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from dataclasses import fields, make_dataclass
 from typing import Annotated, Any, get_args
 
+from analysis.commands import text_table, tidy_csv
 from analysis.figures import panels, scores, spatialseg  # noqa: F401 - they register their figures
 from analysis.figures.inputs import FIGURES, Config
-from analysis.tables import text_table, tidy_csv
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.options import Help, types_of
 from rgbt.config.plain_command import PlainCommand

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import cached_property
 from inspect import Parameter, signature
@@ -13,15 +13,15 @@ import pandas as pd
 from annotated_types import Interval
 from matplotlib.figure import Figure
 
-from analysis.arguments import MOST, dataset_of
-from analysis.bar import progress
+from analysis.commands import MOST, dataset_of, progress
 from analysis.results import open_counts
 from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
+from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.command import built
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
-from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 
 if TYPE_CHECKING:
@@ -47,11 +47,6 @@ AbsentClasses = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoOptions:
-    """Of a figure that shares none with others."""
-
-
 @dataclass(frozen=True)
 class FigureSpec:
     """One figure.
@@ -74,8 +69,8 @@ class FigureSpec:
             (p.name, hints[p.name], MISSING if p.default is p.empty else p.default)
             for p in self._keywords
         ]
-        shared = hints.get("given", NoOptions)
-        return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
+        shared = (hints["given"],) if "given" in hints else ()
+        return make_dataclass("Options", own, bases=shared, frozen=True, kw_only=True)
 
     @property
     def words(self) -> list[str]:
@@ -206,11 +201,9 @@ class RunOptions:
         return found
 
     def counts(self, *frames: str) -> dict[str, list[Counts]]:
-        """Label -> counts of its seeds; InputError: methods on different images."""
+        """Label -> counts of its seeds."""
         opened = self.open(open_counts, *frames).items()
-        found = {label: [each.counts for each in named] for label, named in opened}
-        check_same_images(found)
-        return found
+        return {label: [each.counts for each in named] for label, named in opened}
 
 
 def chosen_names(names: str, known: Sequence[str], number: int) -> list[str]:
@@ -248,23 +241,18 @@ def open_scored(methods: str, partition: str) -> dict[str, Counts]:
     """
     places = labelled(methods).items()
     found = {label: Counts.load(file_in(each, f"counts_{partition}.npz")) for label, each in places}
-    check_same_images({label: [counts] for label, counts in found.items()})
+    check_same_images(found.values())
     return found
 
 
-def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
-    """Refuse methods on different images, or with means over different classes, side by side."""
-    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
-    (first, reference), *others = every
-    for label, counts in others:
-        if counts.dataset != reference.dataset or set(counts.names) != set(reference.names):
-            raise InputError(
-                f"'{first}' was scored on {len(reference.names)} images of split "
-                f"'{reference.split}', such as '{reference.names[0]}', but '{label}' on "
-                f"{len(counts.names)} of '{counts.split}', such as '{counts.names[0]}'; a figure "
-                "shows methods on the same images of one data set."
-            )
-        check_same_means(reference, counts)
+def check_same_images(every: Iterable[Counts]) -> Counts:
+    """The first counts; InputError: others on other images, or by other classes or regions."""
+    reference, *others = every
+    for other in others:
+        if other.dataset != reference.dataset:
+            raise InputError("a figure shows methods on the images of one data set.")
+        in_order(reference, other, "names")
+    return reference
 
 
 def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:

@@ -1,7 +1,6 @@
 """Pictures: qualitative panels, pairs of frames with predictions of both, and examples of masks.
 
-None of the papers says how its images were chosen. Here they are named, or selected by a stated
-rule.
+None of the papers says how its images were chosen. Here they are named, or the first ones.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from analysis.arguments import MOST
-from analysis.bar import progress
+from analysis.commands import MOST
 from analysis.figures import plots
 from analysis.figures.inputs import (
     Config,
@@ -35,7 +33,6 @@ from analysis.figures.inputs import (
     figure,
     labelled,
 )
-from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
@@ -43,7 +40,7 @@ from rgbt.data.files import decode, read_rgb
 from rgbt.data.mfnet import NextFrames
 from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader
 from rgbt.metrics.counting import RegionCounter
-from rgbt.metrics.counts import Counts, scored_classes
+from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.pair_list import ListedPair, read_list
 from rgbt.metrics.scores import miou
@@ -77,10 +74,6 @@ HIDDEN = (150, 190, 230)
 Rows = Annotated[Count, Help("number of images")]
 Layout = Annotated[
     Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
-]
-Pick = Annotated[
-    Literal["first", "largest_difference"],
-    Help("images shown: first, or largest_difference of the first and the last method"),
 ]
 
 
@@ -126,22 +119,13 @@ def read_prediction(
 @figure("spatialseg/fig8", "qualitative results", "dataset", "metric")
 @figure("spatialseg/fig9", "qualitative results on another data set", "dataset", "metric")
 @figure("crm/fig4", "qualitative results", "dataset", "metric")
-def qualitative(config: Config, given: PictureOptions, *, pick: Pick = "first") -> Drawn:
+def qualitative(config: Config, given: PictureOptions) -> Drawn:
     """RGB, thermal, ground truth and predictions, with a white box on the centre."""
-    folders, dataset, names = labelled(given.methods), config.dataset, given.names
-    if pick == "largest_difference" and not names:
-        split = given.split or "test"
-        options = ScoringOptions(partitions=("ring",), regions=1, format=given.form)
-        mious = {}
-        with progress("comparing", len(folders) * len(dataset.names(split))) as advance:
-            for label, folder in folders.items():
-                (counts,) = score_folder(folder, dataset, split, options, advance).counts
-                mious[label] = image_mious(counts)
-        names = ",".join(most_different(mious, given.rows))
-    shown, regions = config.names(names, given.split, given.rows), config.regions
+    shown, regions = config.names(given.names, given.split, given.rows), config.regions
     if regions.aspect is None:
         raise InputError(f"metric: {regions.name} has no centre to put a box on; use rings.")
-    made, cells, frame = panel(dataset, folders, shown, given.form, given.layout)
+    folders = labelled(given.methods)
+    made, cells, frame = panel(config.dataset, folders, shown, given.form, given.layout)
     height, width = cells[0, 0].images[0].get_array().shape[:2]
     rows, columns = ring_rectangle((height, width), regions.regions, 1, regions.aspect)
     corner = (columns.start - 0.5, rows.start - 0.5)
@@ -223,28 +207,6 @@ def check_one_size(sizes: Sequence[tuple[int, ...]]) -> None:
     """Refuse images of several sizes."""
     if len(set(sizes)) > 1:
         raise InputError(f"names: the images have different sizes {sorted(set(sizes))}.")
-
-
-def image_mious(counts: Counts) -> dict[str, float]:
-    """Name -> mIoU of that image alone, percent, over the scored classes in it (else NaN)."""
-    scores = 100 * miou(counts.counts.sum(1), "exclude", counts.scored)
-    return dict(zip(counts.names, scores.tolist(), strict=True))
-
-
-def most_different(scores: Mapping[str, Mapping[str, float]], number: int) -> tuple[str, ...]:
-    """Names of the images where the last method differs most from the first, that most first.
-
-    `scores`: method -> name -> score of that image; images with a NaN are left out. InputError:
-    fewer than two methods, or fewer images than requested.
-    """
-    if len(scores) < 2:
-        raise InputError("pick=largest_difference compares two methods; give two in methods=...")
-    first, *_, last = scores.values()
-    gaps = {name: abs(last[name] - first[name]) for name in first}
-    known = [name for name, gap in gaps.items() if not math.isnan(gap)]
-    if len(known) < number:
-        raise InputError(f"rows={number}, but there are only {len(known)} images to choose from.")
-    return tuple(sorted(known, key=lambda name: -gaps[name])[:number])
 
 
 class Frame(NamedTuple):
@@ -340,24 +302,11 @@ class Pairs:
 
 
 @figure("temporal/fig1", "a real frame and its synthesised next one", "dataset", "consistency")
-def pair_rows(
-    config: Config,
-    given: PairOptions,
-    *,
-    pick: Pick = "first",
-    rows: Rows = 1,
-) -> Drawn:
+def pair_rows(config: Config, given: PairOptions, *, rows: Rows = 1) -> Drawn:
     """Both frames, ground truth and predictions; pixels that lower TC are outlined."""
     opened = Pairs(config, given)
-    methods, listed, names = [*opened.methods], [*opened.listed], given.names
-    if pick == "largest_difference" and not names:
-        shares = {name: opened.read(name).shares for name in listed}
-        by_method = {
-            label: {name: each[index] for name, each in shares.items()}
-            for index, label in enumerate(methods)
-        }
-        names = ",".join(most_different(by_method, rows))
-    shown = [opened.read(name) for name in chosen_names(names, listed, rows)]
+    methods = [*opened.methods]
+    shown = [opened.read(name) for name in chosen_names(given.names, [*opened.listed], rows)]
     check_one_size([pair.compared.shape for pair in shown])
     palette = np.array(config.dataset.palette, np.uint8)
     line = Line2D([], [], color=OUTLINE, linewidth=1.2, label=OUTLINED)
@@ -368,16 +317,9 @@ def pair_rows(
 
 
 @figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
-def pair_columns(
-    config: Config,
-    given: PairOptions,
-    *,
-    pick: Pick = "first",
-    rows: Rows = 4,
-    layout: Layout = "columns",
-) -> Drawn:
+def pair_columns(config: Config, given: PairOptions, *, layout: Layout = "columns") -> Drawn:
     """As `pair_rows`, with the number and the layout of the printed figure."""
-    return pair_rows(config, replace(given, layout=layout), pick=pick, rows=rows)
+    return pair_rows(config, replace(given, layout=layout), rows=given.rows)
 
 
 @plots.styled
@@ -432,14 +374,13 @@ def masks(
     *,
     names: Names = "",
     split: Split = "",
-    patches: Annotated[tuple[Count, ...], Help("sides of the patches in pixels")] = PATCHES,
     seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the masks")] = 0,
 ) -> Drawn:
     """CRM, Fig. 5: RGB above, thermal below; what one image hides, the other shows."""
     sample = config.dataset.read(config.names(names, split)[0])
-    chosen = masker_overrides(patches).items()
+    chosen = masker_overrides(PATCHES).items()
     maskers = {title: config.built("masker", *words) for title, words in chosen}
-    examples = mask_examples(sample, maskers, math.lcm(STRIDE, *patches), seed)
+    examples = mask_examples(sample, maskers, math.lcm(STRIDE, *PATCHES), seed)
     pictures = [[each.rgb for each in examples], [each.thermal for each in examples]]
     made, _ = plots.picture_grid(pictures, ("RGB", "thermal"), [*maskers])
     rows = [(e.title, e.rgb_hidden.mean(), e.thermal_hidden.mean()) for e in examples]

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from analysis.arguments import check_out
+from analysis.commands import check_out
 from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import number_places

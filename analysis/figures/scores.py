@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.arguments import Blocks, Level, Resamples
+from analysis.commands import DrawOptions
 from analysis.figures import plots
 from analysis.figures.inputs import (
     Drawn,
@@ -22,13 +22,12 @@ from analysis.figures.inputs import (
     check_same_images,
     figure,
 )
-from analysis.results import CLEAN
-from analysis.robustness import Training, trainings
+from analysis.results import CLEAN, Training, trainings
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.options import Help
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts, check_same_means, convention, scored_classes
+from rgbt.metrics.counts import Counts, convention, scored_classes
 from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
@@ -52,11 +51,8 @@ MISSING = "one image missing"
 SPREAD = 0.3
 """Regions over which bars of several methods stand side by side."""
 
-SHORTEST, LONGEST = 16, 4096
-"""Sides of a heat map of regions in pixels."""
-
-BANDS = {"images": "images", "seeds": "trainings", "both": "both"}
-"""``band=`` -> the interval of `analysis.uncertainty.Estimate`."""
+MAP_HW = (480, 640)
+"""Size of a heat map of regions in pixels."""
 
 
 @figure("temporal/fig5", "TC and CA of variants by class")
@@ -85,12 +81,7 @@ def class_consistency(
     the paper's Table I. InputError: counts of single frames, or of different kinds.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
-    reference, convened = every[0], absent or convention(every)
-    for counts in every:
-        if (counts.partition, counts.classes) != (reference.partition, reference.classes):
-            both = f"{reference.partition} and {counts.partition}"
-            raise InputError(f"runs: counts of different classes or protocols ({both}).")
-        check_same_means(reference, counts)
+    reference, convened = check_same_images(every), absent or convention(every)
     protocol = protocol_of(reference.partition)
     if protocol is None:
         raise InputError(f"runs: {reference.partition} are counts of single frames.")
@@ -127,24 +118,22 @@ def draw_consistency(frame: pd.DataFrame) -> Figure:
     return made
 
 
-Corruptions = Annotated[
-    str, Help("corruptions to show, with commas: noise:rgb,frozen; default: all that were measured")
-]
-
-
 @figure("robustness", "mIoU under corruptions, one panel per corruption, one line per method")
-def robustness(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
+def robustness(
+    given: RunOptions,
+    *,
+    corruptions: Annotated[
+        str, Help("corruptions to show, with commas: noise:rgb,frozen; default: all measured ones")
+    ] = "",
+    score: Annotated[
+        Literal["mIoU", "relative"],
+        Help("relative: in percent of what each training reaches on clean images"),
+    ] = "mIoU",
+) -> Drawn:
     """Mean over trainings, band of one standard deviation, of runs after rgbt robustness."""
     rows = split_list(corruptions, "corruptions") if corruptions else []
     frame = corrupted(given.open(trainings), given.absent, rows)
-    return draw_robustness(frame), frame
-
-
-@figure("robustness/relative", "the same in percent of the mIoU on clean images")
-def robustness_relative(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
-    """Each training in percent of what it reaches on clean images."""
-    _, frame = robustness(given, corruptions=corruptions)
-    return draw_robustness(frame, "relative"), frame
+    return draw_robustness(frame, score), frame
 
 
 def corrupted(
@@ -162,7 +151,7 @@ def corrupted(
         for number, training in enumerate(each)
         for level in training.levels
     ]
-    check_same_images({f"{m} {n} {each.path.stem}": [each.counts] for m, n, each in levels})
+    check_same_images(level.counts for *_, level in levels)
     convened = absent or convention(level.counts for *_, level in levels)
     cells = []
     for method, number, level in levels:
@@ -252,70 +241,45 @@ def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
 
 
 @figure("regions/heat", "mIoU of each region as a heat map, one per method")
-def region_heat(
-    given: RunOptions,
-    *,
-    size: Annotated[
-        str, Help(f"size of the map, HEIGHTxWIDTH, {SHORTEST} to {LONGEST} pixels each")
-    ] = "480x640",
-) -> Drawn:
+def region_heat(given: RunOptions) -> Drawn:
     """Regions painted by their mIoU."""
-    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", size)
-    hw = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not SHORTEST <= min(hw) <= max(hw) <= LONGEST:
-        raise InputError(f"size={size}: expected HEIGHTxWIDTH, {SHORTEST} to {LONGEST} each.")
     frame = region_means(given.counts(), given.absent)
-    return draw_heat(frame, hw), frame
+    return draw_heat(frame, MAP_HW), frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileOptions(RunOptions, DrawOptions):
+    """Counts of runs, with intervals."""
 
 
 @figure("regions/profile", "mIoU by region with intervals, one line per method")
-def region_profile(
-    given: RunOptions,
-    *,
-    band: Annotated[
-        Literal["widest", "images", "seeds", "both"],
-        Help("interval over images, seeds or both; widest: both if possible"),
-    ] = "widest",
-    resamples: Resamples = 10_000,
-    level: Level = 0.95,
-    blocks: Blocks = "auto",
-) -> Drawn:
-    """MIoU over the regions with bands."""
-    drawn = Resampling(resamples=resamples, level=level, blocks=blocks)
-    frame = region_means(given.counts(), given.absent, drawn, band)
-    return draw_profiles(frame, level), frame
+def region_profile(given: ProfileOptions) -> Drawn:
+    """MIoU over the regions with bands: intervals over images, and over seeds where several."""
+    frame = region_means(given.counts(), given.absent, given.settings())
+    return draw_profiles(frame, given.level), frame
 
 
 def region_means(
     methods: Mapping[str, Sequence[Counts]],
     absent: Absent | None,
     settings: Resampling | None = None,
-    band: str = "widest",
 ) -> pd.DataFrame:
     """MIoU by region (value) and of the image of methods, mean over seeds, in percent.
 
-    `band`: what the intervals are over; "widest": both where there are several seeds, else images;
-    without `settings` there are none. InputError: an interval over seeds of a single seed, or
-    counts that do not belong together.
+    Intervals are over images and seeds where there are several seeds, else over images; without
+    `settings` there are none. InputError: counts that do not belong together.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
-    reference, convened, rows = every[0], absent or convention(every), []
-    for counts in every:
-        if counts.partition != reference.partition:
-            both = f"{reference.partition} and {counts.partition}"
-            raise InputError(f"runs: {both}; give counts with one partition.")
-        check_same_means(reference, counts)
+    reference, convened, rows = check_same_images(every), absent or convention(every), []
     regions = [names.region(region) for region in range(1, reference.counts.shape[1] + 1)]
     for label, seeds in methods.items():
-        kind = ("both" if len(seeds) > 1 else "images") if band == "widest" else band
-        if len(seeds) == 1 and kind != "images":
-            raise InputError(f"band={band} needs at least two seeds, but '{label}' has one.")
+        kind = "both" if len(seeds) > 1 else "images"
         metrics = (*regions, names.MIOU)
         means = [float(np.mean([value(m, each, convened) for each in seeds])) for m in metrics]
         ends, covers = [(math.nan, math.nan)] * len(regions), "nothing"
         if settings is not None:
             found = estimate(seeds, regions, replace(settings, absent=convened))
-            intervals = [getattr(found[name], BANDS[kind]) for name in regions]
+            intervals = [getattr(found[name], kind) for name in regions]
             if None not in intervals:
                 ends = [(each.low, each.high) for each in intervals]
                 covers = "images and seeds" if kind == "both" else kind

@@ -333,16 +333,13 @@ def draw_classes(frame: pd.DataFrame, regions: str) -> Figure:
 @plots.styled
 def regions(config: Config, given: MapOptions, *, names: inputs.Names = "") -> Drawn:
     """The regions numbered from 1 over a picture."""
-    if sum([bool(given.maps), bool(given.statistics), config.chooses("dataset")]) != 1:
-        raise InputError("maps: give one of maps=..., statistics=... and dataset=...")
+    if bool(given.maps) == config.chooses("dataset"):
+        raise InputError("maps: give one of maps=... and dataset=...")
     picture: NDArray[Any]
     what, how = "", {"vmin": 0, "vmax": 1}
     if given.maps:
         opened = given.open_maps(given.split)
         picture, what = opened.iou(), f"IoU ({opened.name}, {opened.split})"
-    elif given.statistics:
-        stats = given.open(config)
-        picture, what = occupancy_map(stats), f"sample occupancy ({stats.split})"
     else:
         picture = config.dataset.read(config.names(names, given.split)[0]).rgb
     region_map = config.regions.map((picture.shape[0], picture.shape[1]))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.bar import in_threads
+from analysis.commands import in_threads
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError
 from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, PredictionReader
@@ -21,7 +21,6 @@ from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent, Partition, Regions
 
-Missing = Literal["refuse", "leave_out"]
 Resize = Literal["refuse", "nearest", "stretch"]
 
 PARTITIONS: tuple[Partition, ...] = get_args(Partition)
@@ -41,7 +40,6 @@ class ScoringOptions:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
         format: see `rgbt.data.predictions.FormatOptions`.
-        missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
             label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
             where the ratio of height and width differs.
@@ -53,7 +51,6 @@ class ScoringOptions:
     partitions: tuple[Partition, ...] = PARTITIONS
     regions: int = 5
     format: FormatOptions = FormatOptions()
-    missing: Missing = "refuse"
     resize: Resize = "refuse"
     name: str = ""
     threads: int = 0
@@ -67,7 +64,6 @@ class FolderScores:
     Attributes:
         counts: one per partition, in the order of `ScoringOptions.partitions`.
         maps: counts by pixel; None where the images differ in size.
-        missing: names of the split without a prediction.
         extra: names of PNG files that belong to no image of the split (overlays left out).
         resized: name of an image whose prediction had another size -> both sizes, such as "480x640
             to 720x1280".
@@ -76,7 +72,6 @@ class FolderScores:
     name: str
     counts: tuple[Counts, ...]
     maps: PixelMaps | None
-    missing: tuple[str, ...]
     extra: tuple[str, ...]
     resized: dict[str, str]
 
@@ -90,12 +85,7 @@ class FolderScores:
 
     def remarks(self) -> list[str]:
         """Remarks about the folder that a reader of the numbers needs, one sentence each."""
-        remarks, counted = [], len(self.counts[0].names)
-        if self.missing:
-            remarks.append(
-                f"{len(self.missing)} of {len(self.missing) + counted} images of the split have no "
-                f"prediction and are left out of every number ({_listed(self.missing)})."
-            )
+        remarks = []
         for sizes, number in Counter(self.resized.values()).items():
             remarks.append(
                 f"{number} predictions were resized to their label by the nearest pixel, from "
@@ -112,32 +102,24 @@ class FolderScores:
 
 
 def find(
-    folder: Path, names: Sequence[str], affixes: Affixes, missing: Missing
-) -> tuple[dict[str, Path], tuple[str, ...], tuple[str, ...]]:
-    """The predictions of images: files prefix + NAME + suffix + ".png".
+    folder: Path, names: Sequence[str], affixes: Affixes
+) -> tuple[list[Path], tuple[str, ...]]:
+    """The predictions of images, in their order: files prefix + NAME + suffix + ".png".
 
-    Returns:
-        name -> file in the order of `names`; names without a file; other PNG files, overlays apart.
-
-    Raises:
-        InputError: no such folder, none of the files, or files missing and "refuse".
+    Also the names of other PNG files, overlays apart. InputError: no such folder, or a file misses.
     """
     if not folder.is_dir():
         raise InputError(f"predictions: no such folder: {folder}")
     stems = {path.stem for path in folder.glob("*.png")}
-    own = {name: affixes.file_stem(name) for name in names}
-    paths = {name: folder / f"{stem}.png" for name, stem in own.items() if stem in stems}
-    absent = tuple(name for name in names if name not in paths)
-    if not paths or (absent and missing == "refuse"):
-        files = [f"{own[name]}.png" for name in absent]
+    own = [affixes.file_stem(name) for name in names]
+    if absent := [f"{stem}.png" for stem in own if stem not in stems]:
         held = _listed(sorted(path.name for path in folder.iterdir())) or "nothing"
         raise InputError(
             f"predictions: {folder} lacks {len(absent)} of the {len(names)} images of the split "
-            f"({_listed(files)}); it contains {held}. Add them, choose another split, or count the "
-            "others alone with missing=leave_out."
+            f"({_listed(absent)}); it contains {held}. Add them, or choose another split."
         )
-    known = {*own.values(), *(f"{name}{OVERLAY}" for name in names)}
-    return paths, absent, tuple(sorted(stems - known))
+    known = {*own, *(f"{name}{OVERLAY}" for name in names)}
+    return [folder / f"{stem}.png" for stem in own], tuple(sorted(stems - known))
 
 
 def score_folder(
@@ -163,10 +145,10 @@ def score_folder(
         InputError: files missing, unreadable, of another size, or with values that are no class;
             of several, the first in the order of the split.
     """
-    affixes = options.format.affixes
-    paths, missing, extra = find(folder, dataset.names(split), affixes, options.missing)
+    names = dataset.names(split)
+    paths, extra = find(folder, names, options.format.affixes)
     reader = PredictionReader(dataset.classes, dataset.palette, options.format)
-    names, maps = tuple(paths), MapSum(dataset.num_classes)
+    maps = MapSum(dataset.num_classes)
     counters = [
         RegionCounter(dataset.num_classes, _regions(partition, options.regions))
         for partition in options.partitions
@@ -186,7 +168,7 @@ def score_folder(
 
     shape = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
     counts, resized = np.zeros(shape, np.int32), {}
-    every = in_threads(count, names, paths.values(), threads=options.threads)
+    every = in_threads(count, names, paths, threads=options.threads)
     for index, (matrices, sizes) in enumerate(every):
         counts[:, index] = matrices
         if sizes:
@@ -204,7 +186,7 @@ def score_folder(
         Counts(counts=by_image, partition=counter.regions.name, **shared)
         for by_image, counter in zip(counts, counters, strict=True)
     ]
-    return FolderScores(name, tuple(made), summed, missing, extra, resized)
+    return FolderScores(name, tuple(made), summed, extra, resized)
 
 
 def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.bar import in_threads
+from analysis.commands import in_threads
 from analysis.statistics.measure import KERNELS, ImageMeasurements, ImageMeter
 from rgbt.checks import InputError, check_choice
 from rgbt.dataset import LabelledDataset
@@ -147,14 +147,12 @@ class MeasurementSettings:
         short_edge: images are resized so that their shorter edge has so many pixels, the images by
             area and the labels to the nearest pixel; 0: as they are.
         workers: threads; 0: one per core.
-        skip_unreadable: leave out what cannot be read, and say so, instead of stopping.
     """
 
     regions: Regions
     kernel: str = KERNELS[0]
     short_edge: int = 0
     workers: int = 0
-    skip_unreadable: bool = False
 
 
 def collect(
@@ -162,7 +160,6 @@ def collect(
     split: str,
     settings: MeasurementSettings,
     advance: Callable[[], object] = lambda: None,
-    unreadable: Callable[[str], object] = lambda _: None,
 ) -> SpatialStatistics:
     """Read and measure every image of a split once.
 
@@ -171,49 +168,37 @@ def collect(
         split: of the data set.
         settings: see `MeasurementSettings`.
         advance: called once per image.
-        unreadable: with `skip_unreadable`, called with a sentence about each image left out; of the
-            first ones twice.
 
     Returns:
         the statistics, images in the order of the split.
 
     Raises:
-        InputError: no such split; a file that cannot be read (without `skip_unreadable`, or all);
-            an image without label or of another size than the first.
+        InputError: no such split; a file that cannot be read; an image without label or of another
+            size than the first.
     """
     names = dataset.names(split)
     nights = dataset.nights(names)
 
-    def read(name: str) -> Sample | None:
-        """None for an image that is left out."""
-        try:
-            return _resized(dataset.read(name), settings.short_edge)
-        except InputError as error:
-            if not settings.skip_unreadable:
-                raise
-            unreadable(str(error))
-            return None
+    def read(name: str) -> Sample:
+        return _resized(dataset.read(name), settings.short_edge)
 
-    like = next(filter(None, map(read, names)), None)
-    if like is None:
-        raise InputError(f"split: none of the {len(names)} images of {dataset.name} can be read.")
+    like = read(names[0])
     region_map = settings.regions.map((like.rgb.shape[0], like.rgb.shape[1]))
     occupied = np.zeros((2, len(dataset.classes), *region_map.shape), np.int32)
     meter, lock = ImageMeter(region_map, len(dataset.classes), settings.kernel), Lock()
 
-    def measure(name: str, night: bool) -> ImageMeasurements | None:
-        measured, sample = None, read(name)
-        if sample is not None:
-            _check(sample, like)
-            measured = meter(sample)
-            with lock:
-                for index in np.flatnonzero(measured.labels.any(0)):
-                    occupied[int(night), index] += sample.label == index
+    def measure(name: str, night: bool) -> ImageMeasurements:
+        sample = read(name)
+        _check(sample, like)
+        measured = meter(sample)
+        with lock:
+            for index in np.flatnonzero(measured.labels.any(0)):
+                occupied[int(night), index] += sample.label == index
         advance()
         return measured
 
     every = in_threads(measure, names, nights or [False] * len(names), threads=settings.workers)
-    kept, rows = zip(*((n, row) for n, row in enumerate(every) if row is not None), strict=True)
+    rows = zip(*every, strict=True)
     return SpatialStatistics(
         dataset=dataset.name,
         fingerprint=dataset.fingerprint(),
@@ -223,10 +208,10 @@ def collect(
         partition=settings.regions.name,
         region_map=region_map,
         kernel=settings.kernel,
-        names=tuple(names[index] for index in kept),
-        night=None if nights is None else np.array(nights, bool)[[*kept]],
+        names=tuple(names),
+        night=None if nights is None else np.array(nights, bool),
         occupied=occupied,
-        **{key: np.stack([getattr(row, key) for row in rows]) for key in ImageMeasurements._fields},
+        **{key: np.stack(each) for key, each in zip(ImageMeasurements._fields, rows, strict=True)},
     )
 
 

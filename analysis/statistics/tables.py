@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pandas as pd
 
+from analysis.commands import text_table
 from analysis.statistics.collect import ALL, SpatialStatistics
-from analysis.tables import text_table
 from rgbt.tables import ABSENT, TextTable
 
 WIDEST = 12

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -24,6 +25,9 @@ MOST = 1_000_000
 
 FEWEST = 10
 """Blocks below which an interval would rest on almost nothing."""
+
+KEPT = 2**21
+"""Most numbers of one set of draws that is kept, as many scores need the same."""
 
 CHUNK = 500
 """Resamples computed at once, which limits the memory that their counts take."""
@@ -100,11 +104,22 @@ class ImageBlocks:
 
     def draws(self, settings: Resampling) -> Iterator[Values]:
         """How often each resample draws each block, (chunk, B); each stratum keeps its number."""
-        rng = numpy_generator(settings.seed, "bootstrap")
-        for start in range(0, settings.resamples, CHUNK):
-            number = min(CHUNK, settings.resamples - start)
-            parts = [rng.multinomial(n, np.full(n, 1.0 / n), number) for n in self.sizes]
-            yield np.hstack(parts).astype(np.float64)
+        given = self.sizes, settings.resamples, settings.seed
+        is_small = self.count * settings.resamples <= KEPT
+        return iter(_kept_draws(*given)) if is_small else _draws(*given)
+
+
+def _draws(sizes: tuple[int, ...], resamples: int, seed: int) -> Iterator[Values]:
+    rng = numpy_generator(seed, "bootstrap")
+    for start in range(0, resamples, CHUNK):
+        number = min(CHUNK, resamples - start)
+        parts = [rng.multinomial(n, np.full(n, 1.0 / n), number) for n in sizes]
+        yield np.hstack(parts).astype(np.float64)
+
+
+@lru_cache(maxsize=4)
+def _kept_draws(sizes: tuple[int, ...], resamples: int, seed: int) -> tuple[Values, ...]:
+    return tuple(_draws(sizes, resamples, seed))
 
 
 def make_blocks(

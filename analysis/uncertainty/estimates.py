@@ -1,4 +1,4 @@
-"""Scores of one method with intervals, and the differences between two methods."""
+"""Scores of one method with intervals, differences between two methods, and their sentence."""
 
 from __future__ import annotations
 
@@ -53,16 +53,6 @@ class Estimate:
     def interval(self) -> Interval | None:
         """The interval to go by: over images and seeds, else over images."""
         return self.both or self.images
-
-    @property
-    def said(self) -> str:
-        """What was drawn, e.g. "40 blocks of up to 10 neighbouring frames"."""
-        return self.evidence.said
-
-    @property
-    def reason(self) -> str:
-        """Why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`."""
-        return self.evidence.reason
 
 
 def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
@@ -160,14 +150,9 @@ class Comparison:
     level: float
 
     @property
-    def said(self) -> str:
-        """How the images of the first metric were drawn, e.g. "393 single images"."""
-        return self.differences[0].difference.said
-
-    @property
-    def reason(self) -> str:
-        """Why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`."""
-        return self.differences[0].difference.reason
+    def evidence(self) -> Evidence:
+        """Of the first metric; it says how the images were drawn, and why."""
+        return self.differences[0].difference.evidence
 
 
 def compare(
@@ -175,34 +160,28 @@ def compare(
     b: Sequence[Counts],
     metrics: Sequence[str],
     settings: Resampling,
-    *,
-    paired: bool = False,
-    same_pixels: bool = True,
 ) -> Comparison:
     """Compare two methods on the same images.
 
     Of counts of one or more trainings of each, in the named metrics (`rgbt.metrics.named`).
-    Seeds of two methods are not `paired` (Welch), but counts i of `a` and of `b` may be of the same
-    training, evaluated in two ways. These need not count the `same_pixels` by the same partition.
+    Seeds of two methods are not paired (Welch).
 
     Raises:
         InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
-            blocks of images of every metric; no such metric; paired, but not as many.
+            blocks of images of every metric; no such metric.
     """
-    if paired and len(a) != len(b):
-        raise InputError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
-    engine = Resampler(settings, "pixels" if same_pixels else "labels")
+    engine = Resampler(settings, "pixels")
     found = []
     for metric in dict.fromkeys(metrics):
         terms = [_term(-1.0, metric, a, "a"), _term(1.0, metric, b, "b")]
-        difference = estimate_of(engine.contrast(terms, paired=paired), settings.level)
+        difference = estimate_of(engine.contrast(terms, paired=False), settings.level)
         sides = [
             estimate_of(engine.contrast([replace(term, weight=1.0)]), settings.level, metric)
             for term in terms
         ]
         found.append(Difference(metric=metric, a=sides[0], b=sides[1], difference=difference))
     if all(each.difference.evidence.blocks < FEWEST for each in found):
-        said = found[0].difference.said
+        said = found[0].difference.evidence.said
         raise InputError(f"{said} are too few to compare two methods; {FEWEST} are the least.")
     ps = holm([each.difference.p for each in found])
     return Comparison(
@@ -216,3 +195,46 @@ def compare(
 def _term(weight: float, metric: str, seeds: Sequence[Counts], side: str) -> Term:
     keys = {seed: f"{side}{seed}" for seed in range(len(seeds))}
     return Term(weight=weight, metric=metric, counts=dict(enumerate(seeds)), keys=keys)
+
+
+def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
+    """The first difference of a comparison as a sentence, with everything that limits it."""
+    found = comparison.differences[0]
+    metric, difference, interval = found.metric, found.difference, found.interval
+    if interval is None:
+        return f"{metric} of {label_a} and {label_b} cannot be compared: nothing to score."
+    images = f"{comparison.images} images"
+    if found.value == 0 and interval.half == 0:
+        same = f"{label_a} and {label_b} have the same {metric}, {found.a.value:.2f}"
+        return f"{same}, on every draw of the {images}."
+    if "blocks" in comparison.evidence.said or "sequences" in comparison.evidence.said:
+        images += f" in {comparison.evidence.said}"
+    trainings = f"{found.a.seeds} and {found.b.seeds} trainings"
+    if found.a.seeds == found.b.seeds:
+        trainings = f"{found.a.seeds} trainings each" if found.a.seeds > 1 else "one training each"
+    # What was not drawn anew and may be all there is to the difference.
+    start, basis = "As trained here, ", f"over {images}; with {trainings}, it says nothing about"
+    basis += " other trainings of the two"
+    if difference.both is not None:
+        start, basis = "", f"over {trainings} and {images}"
+    p, ends = _as_p(difference.p), f"{interval.low:+.2f} to {interval.high:+.2f}"
+    evidence = (
+        f"({found.b.value:.2f} against {found.a.value:.2f}; {100 * comparison.level:g} % interval "
+        f"of the difference {ends}, {p})"
+    )
+    unit = "" if parse(metric).score == names.VAR else " points"
+    if difference.p < 1 - comparison.level and 0.0 not in interval:
+        more = f"{abs(found.value):.2f}{unit} {'higher' if found.value > 0 else 'lower'}"
+        said = f"{start}the {metric} of {label_b} is {more} than that of {label_a} {evidence}"
+        count = len(comparison.differences)
+        corrected = f"corrected for all {count} scores compared, {_as_p(found.p_corrected)}"
+        end = f"; {corrected}" if count > 1 else ""
+    else:
+        said = f"{start}a difference in {metric} between {label_b} and {label_a} is not shown"
+        said += f" {evidence}"
+        end = f"; this data shows only differences above about {interval.half:.2f}{unit}"
+    return f"{said[0].upper()}{said[1:]}, {basis}{end}."
+
+
+def _as_p(value: float) -> str:
+    return "p < 0.001" if value < 0.001 else f"p = {value:.3f}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -38,14 +37,10 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
         )
     only = sorted(set(first.names) ^ set(other.names))
     if only:
-        shared = set(first.names) & set(other.names)
-        advice = (
-            "set missing=leave_out to compare the common images" if shared else "none is in both"
-        )
         raise InputError(
             f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
             f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in only one; "
-            f"score both on one split ({advice})."
+            "score both on one split."
         )
     same = other if other.names == first.names else other.select(first.names)
     if None not in (first.night, same.night) and first.night != same.night:
@@ -53,21 +48,6 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
     if alike != "names":
         _check_labels(first, same)
     return same
-
-
-def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
-    """The counts of the images that all of them hold, in the order of the first.
-
-    Raises:
-        InputError: no image is in all of them.
-    """
-    every = [counts for seeds in methods for counts in seeds]
-    shared = set(every[0].names).intersection(*(counts.names for counts in every))
-    kept = [name for name in every[0].names if name in shared]
-    if not kept:
-        firsts = ", ".join(dict.fromkeys(f"'{counts.names[0]}'" for counts in every))
-        raise InputError(f"no image is in all counts ({firsts}, ...); score all on one split.")
-    return [[counts.select(kept) for counts in seeds] for seeds in methods]
 
 
 def _check_labels(first: Counts, same: Counts) -> None:

@@ -16,7 +16,7 @@ from reference_pages.docstrings import description, parameters
 from reference_pages.guides import about, link
 from reference_pages.markdown import block, code, page, table
 from rgbt.config.component import RUN_SETTINGS, constructor, setting_types
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import conf_dir, load_choice, variants_of
 
 OWN_PAGES = ("experiment",)
 """Groups that have a page of another form (`reference_pages.experiments`)."""
@@ -26,16 +26,18 @@ class ConfigFile(NamedTuple):
     """One file of conf/.
 
     Attributes:
-        name: as it is chosen on the command line.
+        name: of the file, without ".yaml".
         path: from the root of the repository.
         text: of the file.
         about: its first comment, in one line.
+        choices: values of each name that chooses it on the command line: of its variants, too.
     """
 
     name: str
     path: str
     text: str
     about: str
+    choices: dict[str, Any]
 
 
 def groups() -> list[str]:
@@ -48,12 +50,16 @@ def groups() -> list[str]:
 def files_of(group: str) -> list[ConfigFile]:
     """The files of a group, by name."""
     paths = sorted((Path(conf_dir()) / group).glob("*.yaml"))
-    return [_file(path, f"conf/{group}/{path.name}") for path in paths]
+    return [_file(path, group) for path in paths]
 
 
-def _file(path: Path, shown: str) -> ConfigFile:
-    text = path.read_text()
-    return ConfigFile(path.stem, shown, text, " ".join(header(text).split()))
+def _file(path: Path, group: str) -> ConfigFile:
+    text, variants = path.read_text(), variants_of(path)
+    names = [path.stem] if None not in variants.values() else []
+    names += [f"{path.stem}_{each}" for each in variants]
+    choices = {name: load_choice(f"{group}/{name}") for name in names}
+    shown = f"conf/{group}/{path.name}"
+    return ConfigFile(path.stem, shown, text, " ".join(header(text).split()), choices)
 
 
 def header(text: str) -> str:
@@ -114,7 +120,9 @@ def index_page() -> str:
         "# Configuration",
         "A run is composed of one file of each group. `GROUP=FILE` on the command line chooses "
         "another file, `KEY=VALUE` sets one key, and `+experiment=NAME` adds a published method. "
-        "`rgbt run ... --cfg job` prints the whole configuration of a command.",
+        "`rgbt run ... --cfg job` prints the whole configuration of a command. A file may hold "
+        "several choices: `b4` under `_variants_` of `conf/model/cmx.yaml` is `model=cmx_b4`, with "
+        "the values of the file where the variant has no other ones.",
         table(["Group", "What it sets", "Default", "Guide"], rows),
         "## Default configuration",
         "The keys of a run that belong to no group, and the file of each group that is used by "
@@ -151,13 +159,19 @@ def group_page(group: str) -> str:
         f"Guide: {link('groups', group, 2)}" if link("groups", group, 2) else "",
         table(
             ["File", "What it is"],
-            [[f"[`{each.name}`](#{each.name})", first_sentence(each.about)] for each in files],
+            [[_link(each), first_sentence(each.about)] for each in files],
         ),
         "## Settings",
         *_settings(group, files),
         "## Files",
         *(part for each in files for part in (f"### {each.name}", _source(each))),
     )
+
+
+def _link(file: ConfigFile) -> str:
+    """The names that choose a file, with a link to its text."""
+    first, *others = file.choices
+    return ", ".join([f"[`{first}`](#{file.name})", *map(code, others)])
 
 
 def _source(file: ConfigFile) -> str:
@@ -181,13 +195,14 @@ def _settings(group: str, files: list[ConfigFile]) -> Iterator[str]:
     found: dict[str, dict[str, str]] = {}  # target -> key -> the value of the file that sets it
     default = _defaults().get(group)
     said: dict[str, dict[str, str]] = {}
-    for each in sorted(files, key=lambda file: file.name != default):
-        for target, values in _targets(yaml.safe_load(each.text)):
+    pairs = [(name, each) for each in files for name in each.choices]
+    for name, file in sorted(pairs, key=lambda pair: pair[0] != default):
+        for target, values in _targets(file.choices[name]):
             entry = found.setdefault(target, {})
-            said[target] = comments(each.text) | said.get(target, {})
+            said[target] = comments(file.text) | said.get(target, {})
             for key, value in values.items():
                 shown = code(_shown(value))
-                entry.setdefault(key, shown if each.name == default else f"{shown} ({each.name})")
+                entry.setdefault(key, shown if name == default else f"{shown} ({name})")
     if not found:
         yield "These files set keys of other groups. The comments say what each key means."
     for target, values in found.items():

@@ -12,7 +12,8 @@ from reference_pages.markdown import code, page, table
 GROUP = "model/external"
 FACT = re.compile(
     r"(?P<what>.*?)(?: Published: (?P<published>.*))? Repository: (?P<repository>\S+) "
-    r"Commit: (?P<commit>\w+ \(\S+\))\. Licence: (?P<licence>.*?)\.(?: (?P<remarks>.*))?$"
+    r"Commit: (?P<commit>\w+ \(\S+\))\. Licence: (?P<licence>.*?)\. "
+    r"Lists: (?P<lists>.*?)\.(?: (?P<remarks>.*))?$"
 )
 """The comment at the top of a recipe, in one line."""
 
@@ -29,11 +30,15 @@ def external_page() -> str:
         "authors permit no copies of their code.",
         "## Repositories",
         table(
-            ["`model=external/`", "Network", "Published", "Repository", "Commit", "Licence"],
+            [
+                *("`model=external/`", "Network", "Published", "Lists", "Repository", "Commit"),
+                "Licence",
+            ],
             [_origin(each) for each in files],
         ),
         "Published figures are those of the README, or of the paper if the column names it. "
-        "Figures of papers were not compared with the text.",
+        "Figures of papers were not compared with the text. *Lists* are those that the published "
+        'weights were trained and selected on; "not checked" where nobody has read them.',
         "## How they are called",
         table(
             ["`model=external/`", "Constructor", "Feed", "Inputs", "Sizes", "Scores"],
@@ -62,8 +67,8 @@ def _origin(file: ConfigFile) -> list[str]:
     name = stated["repository"]
     link = f"[{name if len(name) < 50 else f'{name[:47]}...'}](https://github.com/{name})"
     return [
-        *(code(file.name), stated["what"].rstrip("."), stated["published"] or "-", link),
-        *(stated["commit"], stated["licence"]),
+        *(code(file.name), stated["what"].rstrip("."), stated["published"] or "-"),
+        *(stated["lists"], link, stated["commit"], stated["licence"]),
     ]
 
 

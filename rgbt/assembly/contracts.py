@@ -26,12 +26,13 @@ from rgbt.types import IGNORE, AnyMasker, Output, Sample
 if TYPE_CHECKING:  # it imports this module
     from rgbt.assembly.session import Session
 
+# Split -> names of its images.
 Lists: TypeAlias = Mapping[str, tuple[str, ...]]
-"""Split -> names of its images."""
 
 DATASET = ("root", "name", "num_classes", "classes", "palette", "unscored", "background", "splits")
 Calls = dict[str, tuple[str, ...]]
 
+# Attributes of a component, its methods and their arguments (`rgbt.checks.check_members`).
 MEMBERS: dict[str, tuple[tuple[str, ...], Calls]] = {
     "dataset": (
         DATASET,
@@ -47,13 +48,12 @@ MEMBERS: dict[str, tuple[tuple[str, ...], Calls]] = {
     "transform": ((), {"train": ("sample", "rng"), "test": ("sample",)}),
     "metric": (("name", "partition", "regions", "absent"), {"map": ("image_hw",)}),
 }
-"""Attributes of a component, its methods and their arguments (`rgbt.checks.check_members`)."""
 
+# Further arguments of a network that returns masks and whose record says stacks_passes=True.
 STACKED = ("passes=", "num_predictions=", "num_masks=")
-"""Further arguments of a network that returns masks and whose record says stacks_passes=True."""
 
+# Arrays of a sample: shape and dtype; equal letters are equal sizes. A label may be None.
 SAMPLE = {"rgb": ("H W 3", "uint8"), "thermal": ("H W", "uint8"), "label": ("H W", "uint8")}
-"""Arrays of a sample: shape and dtype; equal letters are equal sizes. A label may be None."""
 
 
 def is_own(part: object) -> bool:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from lightning_fabric import Fabric
+from numpy.typing import NDArray
 from torch import nn
 
 from rgbt.assembly.contracts import (
@@ -23,6 +25,7 @@ from rgbt.assembly.contracts import (
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
+from rgbt.data.labels import label_pixels
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
@@ -89,6 +92,20 @@ class TrainingSetup:
         return PairedBatches(source, second, first=steps.start, per_step=every)
 
 
+def _class_pixels(session: Session, domain: Domain) -> NDArray[np.int64]:
+    """Pixels of each class in each label of the source's split, (N, K); unlabelled images: 0."""
+    dataset = session.dataset
+    if domain.labels != GIVEN:
+        raise InputError(
+            f"loss.class_weights: expected numbers; weights are computed from labels of the data "
+            f"set, but domains.source.labels is {domain.labels}."
+        )
+    labels = map(dataset.label, dataset.names(domain.split))
+    empty = np.empty(0, np.uint8)
+    counts = [label_pixels(empty if each is None else each, dataset.num_classes) for each in labels]
+    return np.stack(counts)[:, :-1]
+
+
 def validate(spec: RunSpec) -> None:
     """Build all but what unfinished upstream runs will write; errors as of `set_up_training`."""
     for name in spec.domains.named:
@@ -111,7 +128,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
     session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
-    built = spec.build("masker", "loss", "optimizer", "schedule")
+    pixels = partial(_class_pixels, session, domains.source)
+    built = spec.build("masker", "loss", "optimizer", "schedule", class_pixels=pixels)
     masker, loss = built["masker"], built["loss"]
     checked = CheckedLoss(loss) if is_own(loss) else loss
     _share_batch_norm(session.model, session.trainer)
@@ -174,6 +192,13 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
             f"for {name}; choose another recipe=..., or set them and recipe.dataset={name}."
         )
     picked = session.trainer.selection_split
+    is_selected = session.trainer.tested == "best" and session.selection_split is not None
+    trained = set(names[session.domains.source.split])
+    if is_selected and (common := len(trained & set(names[picked]))):
+        info(
+            f"trainer.selection_split={picked}: {common} of its {len(names[picked])} images are "
+            "trained on."
+        )
     is_selected = session.trainer.tested == "best" and picked != "test"
     if is_selected and (shared := _shared_with_test(names, picked)):
         info(

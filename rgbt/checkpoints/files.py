@@ -28,22 +28,23 @@ from rgbt.files.atomic import replacing
 
 COMMENT = b"rgbt sha256 %s"
 
+# Keys under which releases put their weights.
 WRAPPERS = ("state_dict", "model", "module", "model_state_dict")
-"""Keys under which releases put their weights."""
 
+# Prefixes that DataParallel and torch.compile add to every name.
 PREFIXES = ("module.", "_orig_mod.")
-"""Prefixes that DataParallel and torch.compile add to every name."""
 
+# Key of the note in an export, and of the run that a checkpoint belongs to.
 NOTE = "rgbt"
-"""Key of the note in an export, and of the run that a checkpoint belongs to."""
 
 LAST = {"model", "others", "optimizers", "state"}
+# Other keys of a run's last checkpoint, of one with averaged weights, and of the best one.
 OURS = (LAST, LAST | {"unaveraged"}, {"model", "step"})
-"""Other keys of the last checkpoint of a run, of one with averaged weights, and of the best."""
 
 ATTRIBUTES = ("pytorch_lightning.utilities.parsing", "lightning.pytorch.utilities.parsing")
 MM = ("cv.utils.config", "engine.config.config")
 OMEGACONF_NODES = ("Any", "Integer", "Float", "String", "Boolean", "Path", "Bytes", "Enum")
+# Classes of settings: an object is a dictionary, its attributes are those of the dictionary.
 SETTINGS = (
     *(f"{module}.CfgNode" for module in ("detectron2.config", "detectron2.config.config")),
     *("fvcore.common.CfgNode", "fvcore.common.config.CfgNode", "yacs.config.CfgNode"),
@@ -55,16 +56,15 @@ SETTINGS = (
     *("omegaconf.base.ContainerMetadata", "omegaconf.base.Metadata"),
     *(f"omegaconf.nodes.{kind}Node" for kind in OMEGACONF_NODES),
 )
-"""Classes of settings: an object is a dictionary, its attributes are those of the dictionary."""
 
 BUILTINS = ("int", "float", "str", "bool", "list", "dict", "tuple", "frozenset", "bytes")
+# Entries beside weights that hold no weights.
 IGNORED = (
     *(f"pathlib.{kind}" for kind in ("PosixPath", "PurePosixPath", "WindowsPath")),
     *("pathlib.PureWindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"),
     *("collections.defaultdict", "typing.Any"),
     *(f"{module}.{name}" for module in ("builtins", "__builtin__") for name in BUILTINS),
 )
-"""What else stands beside weights; none of it is weights."""
 
 
 def _empty(*_: object) -> dict[Any, Any]:
@@ -81,9 +81,9 @@ KNOWN: list[Any] = [
     *((ARRAY, f"numpy.{core}.multiarray._reconstruct") for core in ("core", "_core")),
 ]
 
-BEFORE = r"(?s)^.*(WeightsUnpickler error: |trusted source\.)"
-AFTER = "Please |In PyTorch |Check the documentation|Exception raised"
-"""torch's advice before and after its reason: weights_only=False, which would execute the file."""
+ADVICE_BEFORE = r"(?s)^.*(WeightsUnpickler error: |trusted source\.)"
+# torch's advice before and after its reason: weights_only=False, which would execute the file.
+ADVICE_AFTER = "Please |In PyTorch |Check the documentation|Exception raised"
 
 DTYPES = (
     *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
@@ -139,7 +139,7 @@ def read_torch_file(path: Path, *, mapped: bool = False) -> Any:
         with torch.serialization.safe_globals(KNOWN):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip and mapped)
     except Exception as error:  # torch raises anything on damaged bytes
-        reason = re.split(AFTER, re.sub(BEFORE, "", str(error)))[0]
+        reason = re.split(ADVICE_AFTER, re.sub(ADVICE_BEFORE, "", str(error)))[0]
         said = one_line(reason) or type(error).__name__
         raise InputError(
             f"{path} cannot be read as weights ({said}); give a file of a saved state_dict()."

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 Tensors = Mapping[str, Tensor]
 
+# Regular expression that fits no name.
 NONE = r"(?!)"
-"""Regular expression that fits no name."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,10 @@ CMNEXT = Kind(
     has=("backbone.patch_embed", "backbone.extra_block1.0.c_nets.", "backbone.extra_downsample_"),
     source=renaming(
         *((f"extra_patch_embed{n + 1}", f"extra_downsample_layers.{n}") for n in range(4)),
-        *((rf"{LAYERS}\.proj)", r"\1.module"), (rf"{LAYERS}\.norm)", r"\1.ln_0")),
-        *((r"(linear_fuse)\.0", r"\1.conv"), (r"(linear_fuse)\.1", r"\1.bn")),
+        (rf"{LAYERS}\.proj)", r"\1.module"),
+        (rf"{LAYERS}\.norm)", r"\1.ln_0"),
+        (r"(linear_fuse)\.0", r"\1.conv"),
+        (r"(linear_fuse)\.1", r"\1.bn"),
     ),
     convention=("model/inputs=imagenet_unit",),
 )
@@ -148,8 +150,8 @@ LATE_RESNET = replace(
     fresh=rf"{PSPNET_RESNET.fresh}|feats\.layer3\.0\.conv1\.",
     unused=r"fc\.|layer3\.0\.(conv1|downsample)\.",
 )
+# Number of a layer in the stem of semseg -> name in its ImageNet file, resnet50_v2.pth.
 STEM = {"0": "conv1", "1": "bn1", "3": "conv2", "4": "bn2", "6": "conv3", "7": "bn3"}
-"""Number of a layer in the stem of semseg -> name in its ImageNet file, resnet50_v2.pth."""
 
 DEEPLAB_RESNET = replace(
     RESNET,
@@ -179,8 +181,8 @@ DINOV2 = Kind(
     fresh=OUTSIDE,
     convention=("model/inputs=cmx", "model.position_resize=factor"),
 )
+# Convention of files with registers.
 SIZE = ("model/inputs=cmx", "model.position_resize=size")
-"""Convention of files with registers."""
 
 
 # The released files hold the periods of the positions rounded to bfloat16.
@@ -194,6 +196,7 @@ DINOV3 = Kind(
 )
 
 
+# Module of rgbt.models -> kinds of files for its networks, in the order they are tried.
 KINDS: Mapping[str, tuple[Kind, ...]] = {
     "mask2former": (CRM, replace(CRM, prefix=""), SWIN, TIMM_SWIN),
     "cmnext": (
@@ -261,7 +264,6 @@ KINDS: Mapping[str, tuple[Kind, ...]] = {
         DINOV3,
     ),
 }
-"""Module of rgbt.models -> kinds of files for its networks, in the order they are tried."""
 
 OWN = Kind("file of rgbt")
 

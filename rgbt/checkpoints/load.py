@@ -17,8 +17,8 @@ from rgbt.checkpoints.kinds import KINDS, NONE, OWN, Kind, family_of
 from rgbt.checks import InputError, not_finite, one_line
 from rgbt.requirements import record_of
 
+# Last word of batch normalisation's counters, which files of old torch versions lack.
 COUNTER = "num_batches_tracked"
-"""Last word of batch normalisation's counters, which files of old torch versions lack."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def plan_for(
         if not any(_under(entry, (part,)) for entry in state):
             raise InputError(f"model.fresh: no name in state_dict() begins with '{part}.'")
     kind = _kind_of(model, contents)
-    # Of a backbone alone: a file of the whole network holds what was drawn.
+    # This holds for a file of a backbone alone: a file of the whole network holds what was drawn.
     drawn = tuple(record_of(model).drawn_anew) if kind.fresh != NONE else ()
     tensors = dict(contents.tensors)
     sources = {entry: kind.prefix + kind.source(entry) for entry in state}

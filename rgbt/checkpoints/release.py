@@ -17,23 +17,23 @@ from rgbt.files.atomic import replacing
 
 FORMATS = ("safetensors", "released")
 
+# The note of an export: network, inputs and run.
 Note = Mapping[str, str]
-"""The note of an export: network, inputs and run."""
 
+# Family -> key under which its releases put the weights ("": at the top), and what is before every
+# name. HeatNet's code loads the file of a PSPNet with no_conf, without discriminators.
 RELEASES = {
     **{"mask2former": ("state_dict", "network."), "semseg": ("state_dict", "module.")},
     **{"cmx": ("model", ""), "pspnet": ("", "module.trgb_segnet.")},
     **dict.fromkeys(("cmnext", "rtfnet", "mfnet", "external"), ("", "")),
 }
-"""Family -> key under which its releases put the weights ("": at the top), and what is before every
-name. HeatNet's code loads the file of a PSPNet with no_conf, without discriminators."""
 
+# Prefix of the names of a network from elsewhere (`rgbt.models.external.network`).
 EXTERNAL_PREFIX = "network."
-"""Before the names of a network from elsewhere (`rgbt.models.external.network`)."""
 
 CLASS_WEIGHT = "sem_seg_head.predictor.class_embed.weight"
+# The last class weight of CRM's released loss.
 NO_OBJECT = 0.1
-"""Last of the class weights of the released loss of CRM."""
 
 
 def convention_of(layout: str, family: str) -> tuple[str, ...]:

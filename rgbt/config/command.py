@@ -40,8 +40,8 @@ from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")
 
+# Groups that are not in the defaults list; a command adds them with a plus.
 ADDED = ("experiment", "search", "debug")
-"""Groups that are not in the defaults list; a command adds them with a plus."""
 
 Main = Callable[[DictConfig, list[str]], int | None]
 

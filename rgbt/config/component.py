@@ -24,11 +24,15 @@ from rgbt.checks import InputError, nearest, one_line
 from rgbt.config.values import check_value
 from rgbt.ranges import Text
 
+# Settings, by node, that the run reads itself and that are not passed to the constructor.
 RUN_SETTINGS: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
     "dataset": {"absent": Literal["released", "exclude"]},
 }
-"""Settings, by node, that the run reads itself and that are not passed to the constructor."""
+# Text after the message that a setting has no value.
+PAGES = {
+    "dataset.root": " (docs/how-to/prepare-data-sets.md says where the images come from)",
+}
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,9 @@ class Component:
             if key == "_target_":
                 continue
             if value == "???":
-                raise InputError(f"'{name}' has no value; give one with {name}=...")
+                raise InputError(
+                    f"'{name}' has no value; give one with {name}=...{PAGES.get(name, '')}"
+                )
             if key in run_settings:
                 check_value(name, value, run_settings[key])
             elif key not in parameters:
@@ -83,10 +89,13 @@ class Component:
         return cls(path, node["_target_"], values, dict(node))
 
     def build(self, **collaborators: Any) -> Any:
-        """The object, with those `collaborators` (a network for a scheme) that it takes."""
+        """The object, with those `collaborators` (a network for a scheme) that it takes.
+
+        Components inside get those that they take, too.
+        """
         parameters = inspect.signature(constructor(self.target, self.path)).parameters
         values = {
-            key: value.build() if isinstance(value, Component) else value
+            key: value.build(**collaborators) if isinstance(value, Component) else value
             for key, value in self.values.items()
         }
         values |= {key: value for key, value in collaborators.items() if key in parameters}

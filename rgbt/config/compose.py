@@ -35,8 +35,10 @@ from rgbt.checks import InputError, nearest
 SEARCH_PATH = "hydra.searchpath"  # names the folders of a user's own files for one command
 OWN_FOLDERS = "RGBT_CONF"  # names them for every composition, with commas (conf/config.yaml)
 
+# Scale -> scale whose files it has, where a choice by scale does not name it.
 SAME_FILES = {"bench": "demo"}
-"""Scale -> scale whose files it has, where a choice by scale does not name it."""
+
+VARIANTS = "_variants_"  # choices of a group that differ from their file in a few values
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -118,16 +120,74 @@ def _by_hydra(words: tuple[str, ...], _own: str) -> bytes:
 
 
 class _ParsedOnce(FileConfigSource):
-    """Copies of parsed files, which Hydra changes: parsing takes half of its time."""
+    """Copies of parsed files, which Hydra changes: parsing takes half of its time.
+
+    A file may hold several choices of its group: ``_variants_: {b0: {...}}`` in cmx.yaml is the
+    choice cmx_b0, whose values replace those of the file. Null is the file itself: ``{b2: null}``
+    makes it the choice cmx_b2 instead of cmx.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         result: ConfigResult = pickle.loads(_parsed(self.path, self.provider, config_path))  # noqa: S301
         return result
 
+    def is_config(self, config_path: str) -> bool:
+        return _place(self.path, config_path) is not None
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        found = set(super().list(config_path, results_filter))
+        if results_filter != ObjectType.GROUP:
+            files = Path(self.path, config_path).glob("*.yaml")
+            found |= {f"{file.stem}_{each}" for file in files for each in variants_of(file)}
+        return sorted(found)
+
+
+def variants_of(file: Path) -> dict[str, dict[str, Any] | None]:
+    """The values of every variant of a file, by the end of its name; {} where it has none."""
+    return _variants(str(file), file.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _variants(file: str, _changed: int) -> dict[str, dict[str, Any] | None]:
+    text = Path(file).read_text(encoding="utf-8")
+    if f"\n{VARIANTS}:" not in text:
+        return {}
+    plain: Any = OmegaConf.to_container(OmegaConf.create(text))
+    return {str(key): values for key, values in plain[VARIANTS].items()}
+
+
+def _place(folder: str, name: str) -> tuple[Path, str | None] | None:
+    """The file of a choice such as "model/cmx_b0", and its variant; None: no such choice."""
+    path = Path(folder, name.removesuffix(".yaml"))
+    file = path.with_name(f"{path.name}.yaml")
+    if file.is_file():
+        return None if None in variants_of(file).values() else (file, None)
+    words = path.name.split("_")
+    for length in range(1, len(words)):
+        file = path.with_name("_".join(words[:length]) + ".yaml")
+        variant = "_".join(words[length:])
+        if file.is_file() and variant in variants_of(file):
+            return file, variant
+    return None
+
 
 @lru_cache(maxsize=4096)
 def _parsed(folder: str, provider: str, name: str) -> bytes:
-    return pickle.dumps(FileConfigSource(provider, folder).load_config(name))
+    source, place = FileConfigSource(provider, folder), _place(folder, name)
+    if place is None:  # Hydra's own message
+        return pickle.dumps(source.load_config(name))
+    result = source.load_config(str(place[0].relative_to(folder)))
+    config = cast("DictConfig", result.config)
+    config.pop(VARIANTS, None)
+    if place[1] is not None:
+        config.merge_with(variants_of(place[0])[place[1]] or {})
+    return pickle.dumps(result)
+
+
+def load_choice(name: str) -> dict[str, Any]:
+    """The values of a choice of ``conf/`` with its defaults, not resolved: "model/cmx_b0"."""
+    result = pickle.loads(_parsed(str(conf_dir()), "conf", name))  # noqa: S301
+    return cast("dict[str, Any]", OmegaConf.to_container(result.config))
 
 
 def available(group: str) -> list[str]:

@@ -94,7 +94,7 @@ def _read(key: str, text: str, annotation: Any) -> Any:
             return adapter.validate_python(each)
         except ValidationError as error:
             errors.append(error)
-    # Of a list or mapping, the message about the text read as YAML names the wrong entry.
+    # For a list or mapping, the error of the text read as YAML names the wrong entry.
     raise refusal(key, errors[-1] if text[:1] in ("[", "{") else errors[0])
 
 

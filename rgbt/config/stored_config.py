@@ -24,8 +24,8 @@ from rgbt.files.yaml_files import read_yaml
 NAMED = re.compile(r"_target_:\s*[\"']?(rgbt\.[\w.]+)", re.ASCII)
 DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
 
+# Target that executes code of the folder in its setting `checkout`.
 EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
-"""Target that executes code of the folder in its setting `checkout`."""
 
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
 

@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, check_range
 from rgbt.types import Sample
 
+# Rows of the images that lengths in pixels are given for: MFNet's.
 REFERENCE_HEIGHT = 480
-"""Rows of the images that lengths in pixels are given for: MFNet's."""
 
 Pixels = NDArray[np.uint8]
 Image = Literal["rgb", "thermal"]
+# Which image of a pair is corrupted.
 Images = Literal["rgb", "thermal", "both"]
-"""Which image of a pair is corrupted."""
 
 NAMES: dict[Images, str] = {"rgb": "RGB", "thermal": "thermal", "both": "RGB and thermal"}
 
+# (rows, columns): up, down, left, right.
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
-"""(rows, columns): up, down, left, right."""
 
+# Purpose -> generator of a sample, the same at every severity: a higher one hides more blocks.
 RngOf = Callable[[str], np.random.Generator]
-"""Purpose -> generator of a sample, the same at every severity: a higher one hides more blocks."""
 
 Severities = Annotated[
     tuple[Annotated[float, Interval(gt=0, le=1000)], ...],
@@ -193,7 +193,7 @@ class Misregistered(Corruption):
     bounds = (0, REFERENCE_HEIGHT / 2)
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
-        """As of `Corruption`."""
+        """Corrupt a sample as `Corruption` says."""
         height = sample.thermal.shape[0]
         distance = nearest_whole(at_height(severity, height))
         if distance == 0:

@@ -14,8 +14,8 @@ from rgbt.types import View
 
 GIVEN, NONE = "given", "none"
 
+# Which head predicts an image: that of its domain, or that of one domain for all images.
 TestedHead = Literal["own", "source", "target"]
-"""Which head predicts an image: that of its domain, or that of one domain for all images."""
 
 
 @dataclass(frozen=True, kw_only=True)

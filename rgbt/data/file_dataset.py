@@ -20,8 +20,11 @@ from rgbt.data.patterns import Frame, Patterns
 from rgbt.requirements import Record
 from rgbt.types import Sample
 
+# Split -> its list file, or several, whose names are all in the split.
+Lists = Mapping[str, str | tuple[str, ...]]
+
+# Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
-"""Split -> names, of the splits whose names could be read."""
 
 
 class FileDataset:
@@ -35,7 +38,8 @@ class FileDataset:
         images: how its images, and new ones of any folder, are read.
         codes: the meaning of label values.
         patterns: of the paths of its files.
-        splits: split -> its list, or the pattern of its files.
+        splits: split -> its list, or the pattern of its files; several lists are joined by "+".
+        files_of: split -> its lists, where they are more than one.
         splits_key: setting that names the splits, for messages.
         mirrored: suffix of the names of mirrored copies, which only training splits may list.
     """
@@ -44,6 +48,7 @@ class FileDataset:
     codes: LabelCodes
     patterns: Patterns
     splits: dict[str, str]
+    files_of: Mapping[str, tuple[str, ...]] = {}
     splits_key = "dataset.splits"
     mirrored: str | None = None
 
@@ -105,10 +110,30 @@ class FileDataset:
         """Names of a known split, in order; () if there are none, InputError if unreadable."""
         return self.lines(split)
 
+    def use_lists(self, lists: Lists) -> None:
+        """Read the names of every split from its list or lists."""
+        several = {split: each for split, each in lists.items() if not isinstance(each, str)}
+        self.splits = {
+            split: each if isinstance(each, str) else "+".join(each)
+            for split, each in lists.items()
+        }
+        self.files_of = several
+
     def lines(self, split: str) -> tuple[str, ...]:
-        """Lines of the list of a split, a file below the root or anywhere; () without a file."""
-        path = self.root / Path(self.splits[split]).expanduser()
-        return read_names(path, f"{self.splits_key}.{split}") if os.path.lexists(path) else ()
+        """Lines of the lists of a split, files below the root or anywhere; () without a file.
+
+        InputError: of several lists one is missing, or two have a line in common.
+        """
+        key = f"{self.splits_key}.{split}"
+        files = self.files_of.get(split, (self.splits[split],))
+        paths = [self.root / Path(each).expanduser() for each in files]
+        if len(paths) == 1 and not os.path.lexists(paths[0]):
+            return ()
+        found = [name for path in paths for name in read_names(path, key)]
+        if len(paths) > 1 and len(set(found)) < len(found):
+            twice = next(name for name in found if found.count(name) > 1)
+            raise InputError(f"{key}: '{twice}' is more than once in {self.splits[split]}.")
+        return tuple(found)
 
     def check_split(self, split: str) -> None:
         """Refuse a split that is not one of `splits`."""

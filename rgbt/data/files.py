@@ -21,22 +21,22 @@ from rgbt.checks import InputError, one_line
 Array = NDArray[np.uint8]
 
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP")
+# The last bytes of a file in these formats, which decoders do not require.
 ENDS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
-"""Last bytes of these formats, which decoders do not require."""
 
+# Pillow's modes that are read, and the bits of a channel in memory.
 DEPTHS = {"1": 1, "L": 8, "P": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 32, "F": 32}
-"""Pillow's modes that are read, and the bits of a channel in memory."""
 
 # Only libtiff refuses a damaged directory of a TIFF; Pillow warns, and reads the rest.
 TiffImagePlugin.READ_LIBTIFF = True
 
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
+# Exceptions of Pillow for damaged files.
 UNREADABLE = (
     *(OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error, zlib.error),
     *(TypeError, KeyError, IndexError, Image.DecompressionBombError),
 )
-"""Exceptions of Pillow for damaged files."""
 
 
 def read_bytes(path: Path) -> bytes:

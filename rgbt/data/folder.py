@@ -18,7 +18,7 @@ from typing import Annotated
 from annotated_types import Interval
 
 from rgbt.checks import InputError, check_choice
-from rgbt.data.file_dataset import FileDataset, SplitNames, hash_of_files
+from rgbt.data.file_dataset import FileDataset, Lists, SplitNames, hash_of_files
 from rgbt.data.images import Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
 from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, Frame, find_frames, in_order, without_rgb
@@ -49,7 +49,7 @@ class Folder(FileDataset):
         unscored: Names = (),
         background: Names = (),
         folders: dict[Text, Text] | None = None,
-        lists: dict[Text, Text] | None = None,
+        lists: dict[Text, Text | Names] | None = None,
         shares: dict[Text, Share] | None = None,
         shares_seed: Seed = 0,
         block: Annotated[int, Interval(ge=1, le=10**6)] | None = None,
@@ -84,7 +84,7 @@ class Folder(FileDataset):
         if split in self._divided:
             return self._divided[split]
         lines = self.lines(split)
-        names = tuple(self._forms.get(line) or self._forms.get(_stem(line), line) for line in lines)
+        names = tuple(map(self._named, lines))
         if lines and set(names).isdisjoint(self.frames):
             raise InputError(
                 f"dataset.lists.{split}: none of the {len(lines)} lines of {self.splits[split]} is "
@@ -93,10 +93,21 @@ class Folder(FileDataset):
             )
         return names
 
+    def _named(self, line: str) -> str:
+        """The frame of a line; of "image,label", as in CART's lists, the label must be its own."""
+        image, comma, label = line.partition(",")
+        if not comma or line in self._forms:
+            return self._forms.get(line) or self._forms.get(_stem(line), line)
+        name = self._forms.get(image) or self._forms.get(_stem(image), image)
+        own = self.frames[name].label if name in self.frames else None
+        if own is not None and own != self.root / label:
+            raise InputError(f"{self.splits_key}: '{line}': the label of '{name}' is {own}.")
+        return name
+
     def _divide(
         self,
         folders: dict[str, str] | None,
-        lists: dict[str, str] | None,
+        lists: Lists | None,
         shares: dict[str, float] | None,
         draw: tuple[int, int | None],
     ) -> SplitNames:
@@ -113,7 +124,8 @@ class Folder(FileDataset):
                 f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
             )
         if lists is not None:
-            self.splits, self.splits_key = lists, "dataset.lists"
+            self.splits_key = "dataset.lists"
+            self.use_lists(lists)
             return {}
         if shares is not None:
             self.splits = {split: f"{share:g} of the frames" for split, share in shares.items()}
@@ -168,14 +180,14 @@ class Folder(FileDataset):
     def _forms(self) -> dict[str, str]:
         """Everything that a line of a list may be -> the name of the frame; names come first.
 
-        The name; the values of the words of the RGB pattern, joined by "/"; the path of the RGB
-        image below the root, with or without suffix; or the value of {name}, if it is unique.
+        The name; the values of the words of the RGB pattern, joined by "/"; the path of the RGB or
+        thermal image below the root, with or without suffix; or the value of {name}, if unique.
         """
         shared = Counter(frame.values[NAME] for frame in self.frames.values())
         forms = {name: name for name in self.frames}
         for name, frame in self.frames.items():
-            path = frame.rgb.relative_to(self.root).as_posix()
-            for form in ("/".join(frame.values.values()), path, _stem(path)):
+            paths = [each.relative_to(self.root).as_posix() for each in (frame.rgb, frame.thermal)]
+            for form in ("/".join(frame.values.values()), *paths, *map(_stem, paths)):
                 forms.setdefault(form, name)
             if shared[frame.values[NAME]] == 1:
                 forms.setdefault(frame.values[NAME], name)

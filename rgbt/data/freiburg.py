@@ -55,12 +55,12 @@ Crop = tuple[Edge, Edge, Edge, Edge]
 LAYOUTS = (
     Patterns.of(*TRAIN[:2]),
     Patterns.of(*TEST[:2]),
-    # Of one part of the archive the stamps of RGB end in a 0 more than those of thermal.
+    # In one part of the archive, the stamps of RGB end in a 0 more than those of thermal.
     Patterns.of(TEST[0].replace("{stamp}", "{stamp}0"), TEST[1]),
 )
 
+# Largest relative difference of the aspect ratios of label and frame, due to rounding.
 MOST_STRETCH = 0.02
-"""Largest relative difference of the aspect ratios of label and frame, due to rounding."""
 
 Array = NDArray[np.uint8]
 
@@ -169,7 +169,7 @@ class Freiburg(FileDataset):
         return tuple(self.frame(name).values["part"].endswith("night") for name in names)
 
     def fingerprint(self) -> str:
-        """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
+        """Digest of `hash_of_files` and the settings of labels (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.images.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(SPLITS):
             names = self._of(split)

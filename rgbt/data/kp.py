@@ -31,8 +31,8 @@ PATTERNS = (
     "images/{set}/{video}/lwir/{frame}.jpg",
     "labels/{set}_{video}_{frame}.png",
 )
+# Recordings of each split, as the lists of the CRM release divide the labelled images.
 SETS = {"train": (0, 1, 2, 3, 4, 5), "val": (6, 10), "test": (7, 8, 9, 11)}
-"""Recordings of each split, as the lists of the CRM release divide the labelled images."""
 
 NIGHT_SETS = (3, 4, 5, 9, 10, 11)
 SETS_OF = {

@@ -9,8 +9,8 @@ from annotated_types import Interval
 
 from rgbt.ranges import BatchSize, NonNegative, Positive, Text, Workers
 
+# Settings that do not change the samples of a batch.
 LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "cache")
-"""Settings that do not change the samples of a batch."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import count
@@ -40,15 +41,15 @@ CROP_ADVICE = "; choose a transform.crop_hw that fits into every resized image"
 EVAL_ADVICE = "; set data.eval_batch_size=1"
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
+# Signals that end a command (`rgbt.runtime.signals`).
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a command (`rgbt.runtime.signals`)."""
 
+# Interval at which a worker checks that its main process exists.
 LOOK_S = 2.0
-"""Interval at which a worker checks that its main process exists."""
 
 Kind = TypeVar("Kind", bound=Loadable)
+# (key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`.
 MakeExample = Callable[[Any, dict[str, str]], Any]
-"""(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 
 
 class Transform(Protocol):
@@ -191,21 +192,24 @@ class Batches(Iterator[Kind]):
         self, reader: BatchReader, *, keys: Iterable[list[Any]], settings: LoaderSettings
     ) -> None:
         self.skipped: dict[str, str] = {}
-        loader = DataLoader(
-            reader,
-            sampler=keys,
-            batch_size=None,  # a key is a whole batch
-            num_workers=settings.num_workers,
-            prefetch_factor=settings.prefetch if settings.num_workers else None,
-            worker_init_fn=start_worker,
-            pin_memory=torch.cuda.is_available(),
-            # Without it the loader draws the seed of its workers from the global generator.
-            generator=torch.Generator(),
-        )
         # Blocked in all threads of the new processes: some libraries start some when forked.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
-            self._loaded = cast(Iterator[LoadedBatch], iter(loader))
+            with warnings.catch_warnings():
+                # More workers than cores wait for each other; nothing else is wrong with them.
+                warnings.filterwarnings("ignore", "This DataLoader will create")
+                loader = DataLoader(
+                    reader,
+                    sampler=keys,
+                    batch_size=None,  # a key is a whole batch
+                    num_workers=settings.num_workers,
+                    prefetch_factor=settings.prefetch if settings.num_workers else None,
+                    worker_init_fn=start_worker,
+                    pin_memory=torch.cuda.is_available(),
+                    # Without it the loader draws the seed of its workers from the global generator.
+                    generator=torch.Generator(),
+                )
+                self._loaded = cast(Iterator[LoadedBatch], iter(loader))
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -342,7 +346,7 @@ def start_worker(_: int) -> None:
 
 def _end_with_parent() -> None:
     """Exit when the main process sends SIGTERM, or has ended."""
-    # Not os.getppid: in a sweep a server forks the workers, and lives longer than the main process.
+    # In a sweep, os.getppid is a server that forks the workers and outlives the main process.
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a main process"
     while parent.is_alive():

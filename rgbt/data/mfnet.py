@@ -31,7 +31,9 @@ LAYOUTS: dict[Layout, tuple[str, str, str]] = {
     "packed": ("images/{name}.png", "images/{name}.png", "labels/{name}.png"),
     "folders": ("RGB/{name}.png", "Thermal/{name}.png", "Label/{name}.png"),
 }
-SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
+SPLITS: dict[str, str | tuple[str, ...]] = {
+    split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")
+}
 
 MIRRORED = "_flip"
 NEXT = "next"
@@ -62,7 +64,7 @@ class MFNet(FileDataset):
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         background: Names = ("unlabeled",),
-        splits: dict[Text, Text] = SPLITS,
+        splits: dict[Text, Text | Names] = SPLITS,
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
         super().__init__(root, name, num_classes, classes, palette, background=background)
@@ -75,7 +77,7 @@ class MFNet(FileDataset):
         self.layout = found[0]
         self.patterns = Patterns.of(*LAYOUTS[self.layout])
         self.codes = indices(num_classes)
-        self.splits = dict(splits)
+        self.use_lists(splits)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`."""
@@ -127,7 +129,7 @@ class NextFrames:
             classes=first.classes,
             background=first.background,
             palette=first.palette,
-            splits=dict(first.splits),
+            splits={**first.splits, **first.files_of},
             layout=first.layout,
         )
 

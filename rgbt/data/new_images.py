@@ -15,14 +15,14 @@ from rgbt.data.patterns import Frame, Patterns, what_is_in
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
 
+# Suffixes of image files.
 KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Suffixes of image files."""
 
+# Layouts that are read for every data set: folders rgb and thermal, or files of four channels.
 PLAIN = (
     *(Patterns.of(f"rgb/{{name}}{kind}", f"thermal/{{name}}{kind}") for kind in KINDS),
     Patterns.of("{name}.png", "{name}.png"),
 )
-"""Layouts that are read for every data set: folders rgb and thermal, or files of four channels."""
 
 
 @dataclass(frozen=True)

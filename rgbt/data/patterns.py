@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 from rgbt.checks import InputError, check_choice
 
+# Words with a meaning: the frame, its split, a group of consecutive frames.
 NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
-"""Words with a meaning: the frame, its split, a group of consecutive frames."""
 
+# Word -> its value in the path of a file.
 WordValues = Mapping[str, str]
-"""Word -> its value in the path of a file."""
 
 
 @dataclass(frozen=True)

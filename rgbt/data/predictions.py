@@ -24,8 +24,8 @@ Array = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 Format = Literal["index", "colour"]
 
+# Ending of the pictures that `rgbt predict` writes beside its predictions.
 OVERLAY = "_overlay"
-"""Ending of the pictures that `rgbt predict` writes beside its predictions."""
 
 
 class Affixes(NamedTuple):

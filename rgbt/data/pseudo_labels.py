@@ -30,8 +30,8 @@ from rgbt.types import Sample
 
 FORMAT = "rgbt pseudo-labels 1"
 MANIFEST = "pseudo_labels.json"
+# Value of the confidence 1 in a file.
 FULL = 65535
-"""Value of the confidence 1 in a file."""
 
 
 class Manifest(TypedDict, total=False):

@@ -21,8 +21,8 @@ PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
 PATTERNS = tuple(f"{{part}}/{kind}/{{name}}.png" for kind in ("rgb", "thermal", "labels"))
 PARTS = ("train", "test")
 
+# The recording of an image: 58_bag21_rect_rgb_frame0000000440 is from bag 21.
 BAG = re.compile(r"(?:^|_)bag(\d+)_")
-"""The recording of an image: 58_bag21_rect_rgb_frame0000000440 is from bag 21."""
 
 
 def bag_of(name: str) -> int | None:

@@ -21,11 +21,11 @@ from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Example
 
+# Labels that are decoded at a time.
 NUM_THREADS = 4
-"""Labels that are decoded at a time."""
 
+# Times that a crop is drawn again. Released: DAFormer, mmseg/datasets/uda_dataset.py.
 MOST_REDRAWS = 10
-"""Times that a crop is drawn again. Released: DAFormer, mmseg/datasets/uda_dataset.py."""
 
 
 def class_probabilities(pixels: PixelCounts, temperature: float) -> NDArray[np.float64]:

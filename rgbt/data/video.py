@@ -30,8 +30,8 @@ from rgbt.dataset import DatasetWrapper, LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
 
+# What a missing number in a video means: an error, or the beginning of another sequence.
 Gaps = Literal["refuse", "split"]
-"""What a missing number in a video means: an error, or the beginning of another sequence."""
 
 Sequences = tuple[tuple[str, ...], ...]
 
@@ -52,11 +52,11 @@ PALETTE = (
 )
 LISTS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
 
+# The frame number of MVSeg is the last four digits before the letter.
 STEM = re.compile(r"(\d*?)(\d{4})")
-"""The frame number of MVSeg is the last four digits before the letter."""
 
-APART = 20_000
-"""Between the numbers of two recordings of MVSeg, so that 10000 does not follow 09999."""
+# Distance of the numbers of two recordings of MVSeg, so that 10000 does not follow 09999.
+RECORDING_GAP = 20_000
 
 
 KINDS = ("jpg", "png")
@@ -309,7 +309,7 @@ class MVSeg(VideoDataset):
                 )
             others = [frame.thermal.with_name(f"{stem}i.{kind}") for kind in KINDS]
             thermal = next((path for path in others if os.path.lexists(path)), frame.thermal)
-            number = int(match[2]) + APART * int(match[1] or 0)
+            number = int(match[2]) + RECORDING_GAP * int(match[1] or 0)
             frames.append((number, frame._replace(thermal=thermal)))
         partners = [each for layout in LAYOUTS for each in layout[1:]]
         self.add(frames, partners, lists, gaps)

@@ -9,7 +9,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from rgbt.checks import InputError
 from rgbt.processes import agreed, num_processes, total
 
-OF_TORCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
+TORCH_LAYERS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
 
 
 def check_batch_norm_parts(parts: int, processes: int) -> None:
@@ -25,7 +25,7 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
     """
     if num_processes() == 1:
         return model
-    known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
+    known = (*TORCH_LAYERS, nn.SyncBatchNorm, SynchronisedBatchNorm)
     for name, module in model.named_modules():
         if isinstance(module, _BatchNorm) and type(module) not in known:
             said = f"model: several devices cannot synchronise '{name}' ({type(module).__name__})"
@@ -38,7 +38,7 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
 
 def _converted(module: nn.Module) -> nn.Module:
     """`module` with every batch normalisation of torch replaced, with its own tensors."""
-    if isinstance(module, OF_TORCH):
+    if isinstance(module, TORCH_LAYERS):
         made = SynchronisedBatchNorm(module.num_features)
         made.__dict__ |= module.__dict__
         return made

@@ -142,7 +142,7 @@ class Recomputed:
 
 
 class KeptStatistics(AbstractContextManager[None]):
-    """Within it, buffers are copies: running statistics are updated in the forward alone."""
+    """A context in which buffers are copies: only the forward updates running statistics."""
 
     def __init__(self, module: nn.Module) -> None:
         self.module = module

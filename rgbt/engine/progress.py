@@ -13,8 +13,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+# Progress goes to stderr; stdout is for results.
 CONSOLE = Console(stderr=True)
-"""Progress goes to stderr; stdout is for results."""
 
 
 def progress() -> Progress:

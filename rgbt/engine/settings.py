@@ -9,16 +9,26 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from annotated_types import Interval
+from pydantic import BeforeValidator
+from pydantic_core import PydanticCustomError
 
 from rgbt import ranges
 
 Precision = Literal["32-true", "bf16-mixed"]
 
-OF_MACHINE = (
+# Settings of the training loop that do not change the result.
+MACHINE_SETTINGS = (
     *("accelerator", "log_every", "checkpoint_every", "devices"),
     *("activation_checkpointing", "memory_format", "compile"),
 )
-"""Settings of the training loop that do not change the result."""
+
+
+def _not_gpu(value: object) -> object:
+    if value == "gpu":
+        raise PydanticCustomError(
+            "gpu", "write cuda for a GPU of NVIDIA or AMD, mps for one of Apple"
+        )
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +45,7 @@ class TrainerSettings:
     accumulate: Annotated[int, Interval(ge=1, le=10_000)]
     clip_norm: ranges.Positive | None
     precision: Precision
-    accelerator: Literal["auto", "cpu", "cuda", "mps"]
+    accelerator: Annotated[Literal["auto", "cpu", "cuda", "mps"], BeforeValidator(_not_gpu)]
     threads: ranges.Threads
     selection_split: ranges.Text
     tested: Literal["best", "last"] = "best"

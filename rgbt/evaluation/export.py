@@ -30,11 +30,11 @@ from rgbt.types import View
 
 NO_TRACKING = "rgbt.tracking.mlflow_store.NoTracking"
 
+# Height and width, pixels.
 Hw = tuple[int, int]
-"""Height and width, pixels."""
 
+# RGB (B, 3, H, W) and thermal (B, 1, H, W) in [0, 1] to class scores (B, K, H, W).
 ScoresOf = Callable[[Tensor, Tensor], Tensor]
-"""RGB (B, 3, H, W) and thermal (B, 1, H, W) in [0, 1] to class scores (B, K, H, W)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def export(session: Session, request: ExportRequest) -> tuple[Description, Compa
         head=head,
         outputs=record_of(session.model).outputs,
         image_hw=image_hw,
-        # Where runs are tracked may hold a password and does not change a prediction.
+        # The address of the tracking may hold a password, and does not change a prediction.
         settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
     )
     content = onnx_bytes(graph, description)

@@ -32,11 +32,11 @@ from rgbt.requirements import check_requirements
 from rgbt.types import IGNORE, Batch
 
 USUAL_FLOW: FlowSource = "both"
+# Usual source of the flow of videos, and least share of used pixels of a pair.
 LEAST_USED = 0.1
-"""Usual source of the flow of videos, and least share of used pixels of a pair."""
 
+# Class maps (B, H', W') uint8, at the size of the labels, of frames and their names.
 Predict = Callable[[Batch, Sequence[str]], Tensor]
-"""Class maps (B, H', W') uint8, at the size of the labels, of frames and their names."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Pairing:
 
     @classmethod
     def of(cls, frames: Frames, flow: str, least_used: float) -> Pairing:
-        """From options of a command, of which `flow` may be "default" or "exact"."""
+        """The source of pairs that a command's options name; `flow` may be "default" or "exact"."""
         if flow == "default":
             return cls(frames, USUAL_FLOW if frames == "video" else None, least_used)
         return cls(frames, None if flow == "exact" else cast(FlowSource, flow), least_used)
@@ -234,7 +234,7 @@ def _virtual_scenes(
         valid = at_label.inside() & (label != IGNORE)
         compared: dict[Protocol, Compared] = {
             "aligned": Compared(at_label.nearest(first, 0), second, label, valid),
-            # As released: the first prediction stays where it is, and every pixel counts.
+            # The release does this: the first prediction stays where it is, and every pixel counts.
             "released": Compared(first, second, label, None),
         }
         images = (pairs.first.rgb, pairs.second.rgb)

@@ -56,7 +56,7 @@ class PairSource:
 
     @classmethod
     def compose(cls, overrides: Sequence[str]) -> PairSource:
-        """From overrides of the configuration; images have the size of their files."""
+        """Compose overrides of the configuration; images have the size of their files."""
         words = [*overrides, "transform=none"]
         with composing(words):
             config = compose(words)

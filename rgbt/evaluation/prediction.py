@@ -39,8 +39,8 @@ if TYPE_CHECKING:  # it imports this module
 Names = tuple[str, ...]
 
 
+# Images and how they are counted: with a network, or for predictions of any method.
 EvaluationData: TypeAlias = "Session | PairSource"
-"""Images and how they are counted: with a network, or for predictions of any method."""
 
 
 class Predictor:
@@ -225,7 +225,7 @@ def parts_of_split(
 def normalised(
     session: Session, predictor: Predictor, request: EvaluationRequest, sources: Names
 ) -> Iterator[Names]:
-    """Within it, the network has the requested statistics of `sources`; afterwards its own.
+    """A context in which the network has the requested statistics of `sources`.
 
     Gives the names of unreadable images, which are not in the statistics.
     """

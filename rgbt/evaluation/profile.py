@@ -29,8 +29,8 @@ from rgbt.randomness import numpy_generator
 from rgbt.runs.provenance import machine
 from rgbt.tables import ABSENT, TextTable, csv_text
 
+# Confidence of the interval of a ratio.
 CONFIDENCE = 0.95
-"""Of the interval of a ratio."""
 
 FLOPS = (
     "FLOPs: of convolutions and matrix products; a multiplication and its addition are two "
@@ -57,6 +57,7 @@ class ProfileSettings:
     measure: bool = True  # False: parameters and operations only
 
 
+# Header of the printed table -> column of `Profile.networks`, unit, decimals.
 COLUMNS = {
     "parameters, M": ("parameters", 1e6, 2),
     "trainable, M": ("trainable", 1e6, 2),
@@ -70,7 +71,6 @@ COLUMNS = {
     "from": ("ratio_low", 1, 3),
     "up to": ("ratio_high", 1, 3),
 }
-"""Header of the printed table -> column of `Profile.networks`, unit, decimals."""
 
 
 @dataclass(frozen=True)

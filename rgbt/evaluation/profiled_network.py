@@ -30,11 +30,11 @@ from rgbt.runs.folder import find_run
 from rgbt.runs.specify import load_spec
 from rgbt.types import Batch, View
 
+# The scale where none is given: the networks of the demo are tiny.
 SCALE = "scale=paper"
-"""Used where no scale is given: the networks of the demo are tiny."""
 
+# Height and width, pixels.
 Hw = tuple[int, int]
-"""Height and width, pixels."""
 
 
 @dataclass(frozen=True)

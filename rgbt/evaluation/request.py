@@ -117,12 +117,12 @@ class BatchNormRequest:
 
     @property
     def file_stem(self) -> str:
-        """For file names: "norm-adabn", "norm-adabn-train_day-train_night"."""
+        """Part of file names: "norm-adabn", "norm-adabn-train_day-train_night"."""
         return "-".join(("norm", self.kind, *self.splits))
 
     @property
     def title(self) -> str:
-        """For people: "AdaBN", "AdaBN of train_day, train_night"."""
+        """Text of titles: "AdaBN", "AdaBN of train_day, train_night"."""
         title = "AdaBN" if self.kind == "adabn" else f"{self.kind} statistics"
         return f"{title} of {', '.join(self.splits)}" if self.splits else title
 
@@ -151,7 +151,7 @@ class CorruptionRequest:
 
     @property
     def file_stem(self) -> str:
-        """For file names: "occluded-0.5", or "occluded-0.5_block-16" where that was changed."""
+        """Part of file names: "occluded-0.5", "occluded-0.5_block-16" where that was changed."""
         return self._with_changes(f"{self.name}-{self.severity:g}")
 
     def _with_changes(self, first: str) -> str:
@@ -160,7 +160,7 @@ class CorruptionRequest:
 
     @property
     def title(self) -> str:
-        """For people: "occluded, thermal 0.5 (share of blocks)"."""
+        """Text of titles: "occluded, thermal 0.5 (share of blocks)"."""
         kind = self.corruption
         return f"{kind.title} {self.severity:g} ({kind.unit})" if kind.unit else kind.title
 

@@ -30,15 +30,15 @@ from rgbt.tables import TextTable, csv_text, percent
 from rgbt.types import View
 
 FORMAT = "rgbt robustness 1"
+# Folder in ``evaluations/`` of a run; `analysis.results` looks for curves there.
 FOLDER = "robustness"
-"""Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
 
 CLEAN = "clean"
+# View -> title: the network gets both images, and the features of one branch are decoded.
 FEATURES: dict[View, str] = {
     "thermal": "thermal alone (features)",
     "rgb": "RGB alone (features)",
 }
-"""View -> title: the network gets both images, and the features of one branch are decoded."""
 
 SCORES = (MIOU, subset(DAY, MIOU), subset(NIGHT, MIOU))
 
@@ -56,8 +56,8 @@ class Condition:
     corruption: CorruptionRequest | None = None
 
 
+# A condition, and the mIoU of each part of its counts as a fraction.
 Measured = tuple[Condition, dict[str, float]]
-"""A condition, and the mIoU of each part of its counts as a fraction."""
 
 
 def conditions(session: Session, corruptions: Sequence[CorruptionRequest]) -> list[Condition]:

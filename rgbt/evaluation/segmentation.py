@@ -26,7 +26,7 @@ from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.metrics import scores
 from rgbt.metrics.counting import DetailCounter, RegionCounter
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import OF_SCENES, DetailKind
+from rgbt.metrics.details import SCENE_KINDS, DetailKind
 from rgbt.metrics.metric import Regions
 from rgbt.processes import collected, num_processes
 from rgbt.tables import ClassTable, RegionTable, ResultTables, TextTable, number
@@ -35,8 +35,8 @@ from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.transforms.maps import nearest
 from rgbt.types import View
 
+# Images of the qualitative panel: the same number by day and by night if the split has both.
 NUM_PANELS = 6
-"""Images of the qualitative panel: the same number by day and by night if the split has both."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _detail_counters(
     """A counter of each requested kind; InputError for scenes that the data set does not know."""
     dataset, regions, num_classes = session.dataset, session.regions, len(session.dataset.classes)
     for each in request.details:
-        if each.kind in OF_SCENES and not isinstance(reader_of(dataset), KnownScenes):
+        if each.kind in SCENE_KINDS and not isinstance(reader_of(dataset), KnownScenes):
             raise InputError(f"details={each.kind}: {dataset.name} has no maps of its scenes.")
     return {each.kind: DetailCounter(num_classes, regions, each) for each in request.details}
 
@@ -163,7 +163,7 @@ def _details_of(
     """The details of one image from its label, classes and confidences (H, W)."""
     label, classes, confidence = maps
     further: dict[DetailKind, tuple[Any, ...]] = {"boundary": (), "calibration": (confidence,)}
-    if counters.keys() & set(OF_SCENES):
+    if counters.keys() & set(SCENE_KINDS):
         reader = reader_of(dataset)
         assert isinstance(reader, KnownScenes), "otherwise there is no such counter"
         scene = reader.scene_maps(name)

@@ -26,12 +26,12 @@ from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import CHANGES, SCORES_OF, pair_scores, value
 from rgbt.metrics.names import CA, TC, consistency
 from rgbt.metrics.pairs import HEADLINES, Protocol, partition_name
-from rgbt.metrics.scores import class_mean
+from rgbt.metrics.scores import absent_rule, class_mean
 from rgbt.tables import ConsistencyTable, TextTable
 from rgbt.tracking.pair_pictures import PairExample
 
+# Number of the set of views -> (K + 1, K, K) of one scene.
 CountsBySet = dict[int, NDArray[np.int64]]
-"""Number of the set of views -> (K + 1, K, K) of one scene."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +150,8 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         for protocol, counts in found.items()
         if TC in HEADLINES[protocol]
     }
+    there = pair_scores(TC, like.by_region(), like.partition, "exclude")
+    lacking = [name for name, tc in zip(like.classes, there, strict=True) if np.isnan(tc)]
     return ConsistencyTable(
         names=like.classes,
         tc={protocol: tuple(map(float, tc)) for protocol, (tc, _) in scores.items()},
@@ -157,6 +159,7 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         mean_tc={each: float(class_mean(tc, like.scored)) for each, (tc, _) in scores.items()},
         mean_ca={each: float(class_mean(ca, like.scored)) for each, (_, ca) in scores.items()},
         unscored=like.unscored,
+        notes=(f"{absent_rule(absent)} Without one: {', '.join(lacking) or 'no class'}.",),
     )
 
 

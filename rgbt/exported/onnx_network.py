@@ -25,18 +25,18 @@ from rgbt.files.plain_files import parse_json, read_bytes
 from rgbt.requirements import Outputs, Record, record_of
 from rgbt.types import Output, View
 
+# Prefix of every name in the metadata of a file.
 PREFIX = "rgbt."
-"""Of every name in the metadata of a file."""
 
+# The packages that the optional extra `export` installs.
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
-"""What the optional extra `export` installs."""
 
+# Version of the ONNX operators: the one that PyTorch's exporter is written for. grid_sample of
+# deformable attention requires 16.
 OPSET = 18
-"""Version of the ONNX operators: the one that PyTorch's exporter is written for. grid_sample of
-deformable attention requires 16."""
 
+# Inputs of the graph, with their channels.
 INPUTS = {"rgb": 3, "thermal": 1}
-"""Inputs of the graph, with their channels."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ GROUP = Path("model", "external")
 
 
 def adapter_of(constructor: str) -> Path | None:
-    """The adapter that "gmnet.py:network" names; None where it names a module of the checkout.
+    """The adapter that "adapters.py:gmnet" names; None where it names a module of the checkout.
 
     It lies in ``conf/model/external/``, or in such a folder of the user's own (``RGBT_CONF``), and
     never elsewhere, so that a stored configuration cannot name another file. FileNotFoundError:

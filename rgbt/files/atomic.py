@@ -11,15 +11,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+# Seconds between two attempts to take a lock.
 POLL_S = 0.1
-"""Seconds between two attempts to take a lock."""
 
+# Temporary names with the process that wrote them (none: the holder of the run's lock), and the
+# age in seconds above which such a file is abandoned.
 LEFT_BEHIND, STALE_S = re.compile(r"\..+\.partial|\..+\.(\d+)"), 3600.0
-"""Temporary names with the process that wrote them (none: the holder of the run's lock), and the
-age in seconds above which such a file is abandoned."""
 
+# Descriptors of locks of this process; loader workers forked from it must not keep them.
 _held: set[int] = set()
-"""Descriptors of locks of this process; loader workers forked from it must not keep them."""
 
 
 def write_atomic(path: Path, content: bytes) -> None:

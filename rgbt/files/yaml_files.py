@@ -14,8 +14,8 @@ from omegaconf._utils import get_yaml_loader  # private: its rules for numbers a
 from rgbt.checks import InputError, one_line
 from rgbt.files.plain_files import read_bytes
 
+# Tags whose values are plain; every other one is refused.
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
-"""Tags whose values are plain; every other one is refused."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

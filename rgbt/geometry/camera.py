@@ -20,15 +20,15 @@ from rgbt.ranges import Pixels, Positive
 
 Coordinate = Annotated[float, Interval(ge=-0.5, le=8192)]
 
+# Order of the elementary rotations in the product: "zyx" = Rz Ry Rx, Eq. 1 of the paper;
+# "zxy" = Rz Rx Ry, its release (the two differ by up to 17 pixels at the corners of 480x640).
 Order = Literal["zyx", "zxy"]
-"""Order of the elementary rotations in the product: "zyx" = Rz Ry Rx, Eq. 1 of the paper;
-"zxy" = Rz Rx Ry, its release (the two differ by up to 17 pixels at the corners of 480x640)."""
 
+# Which part of a view is cut out: the largest rectangle, or that of the release.
 Rule = Literal["largest", "corners"]
-"""Which part of a view is cut out: the largest rectangle, or that of the release."""
 
+# Pixels by which a computed corner may leave the polygon: rounding, far below 1/32 pixel.
 SLACK = 1e-6
-"""Pixels by which a computed corner may leave the polygon: rounding, far below 1/32 pixel."""
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 
+# Images that the flow is estimated from; "both": at each pixel, the one whose flows agree best.
 FlowSource = Literal["rgb", "thermal", "both"]
-"""Images that the flow is estimated from; "both": at each pixel, the one whose flows agree best."""
 
+# Least height and width of frames in pixels: two patches of the estimation.
 SMALLEST = 16
-"""Least height and width of frames in pixels: two patches of the estimation."""
 
+# Limit of the squared disagreement of two flows: 0.01 (|w|^2 + |w'|^2) + 0.5 square pixels.
 RELATIVE, ABSOLUTE = 0.01, 0.5
-"""Limit of the squared disagreement of two flows: 0.01 (|w|^2 + |w'|^2) + 0.5 square pixels."""
 
 Gray = NDArray[np.uint8]
 Flow = NDArray[np.float32]

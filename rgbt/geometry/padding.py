@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn import functional as F
 
+# Networks here see images whose sides are multiples of this (SpatialSeg and CRM releases).
 STRIDE = 32
-"""Networks here see images whose sides are multiples of this (SpatialSeg and CRM releases)."""
 
 
 def padded_hw(image_hw: tuple[int, int], multiple: int = STRIDE) -> tuple[int, int]:

@@ -20,13 +20,13 @@ from rgbt.checks import check_shape
 from rgbt.geometry.padding import pad_to
 from rgbt.types import IGNORE
 
+# How often a value is interpolated: "once", along the composed map, where the border pixels of the
+# first frame reach to its outline; "twice", as in the release of Temporal: onto the canvas, where
+# borders fade into zeros, and from the cut rectangle to the full size.
 Resampling = Literal["once", "twice"]
-"""How often a value is interpolated: "once", along the composed map, where the border pixels of the
-first frame reach to its outline; "twice", as in the release of Temporal: onto the canvas, where
-borders fade into zeros, and from the cut rectangle to the full size."""
 
+# A coordinate in pixels that is outside every frame.
 NOWHERE = -1e6
-"""A coordinate in pixels that is outside every frame."""
 
 
 def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
@@ -207,7 +207,7 @@ class Warp:
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """First pixel + floor(i * cut / size)."""
-    # With OpenCV's rounding, which decides where the product is whole, as at 576 of 640 pixels.
+    # OpenCV's rounding is used, which decides where the product is whole, as at 576 of 640 pixels.
     step = 1 / (pixels.shape[-1] / (high - low))
     first = low + 0.5
     return first.floor() + (first.frac() + pixels * step).floor()

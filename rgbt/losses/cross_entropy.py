@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from annotated_types import Len
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -17,6 +20,10 @@ from rgbt.types import IGNORE, Batch, Loss, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
+Computed = Literal["enet", "median_frequency", "inverse"]
+ClassPixels = Callable[[], NDArray[np.int64]]
+"""Pixels of each class in each label of the training split, (N, K)."""
+
 TINY = torch.finfo(torch.float32).tiny  # divisor where nothing counts, of a sum that is 0
 
 
@@ -26,15 +33,24 @@ class CrossEntropy:
     q is the confidence of the label, 1 where labels carry none; it does not enter the mean that is
     divided by, so that labels of which the teacher is not sure cost little (HeatNet's release,
     weight_ir_sup). Pixels labelled 255 are left out; a batch without a labelled pixel costs 0.
-    `class_weights` are c, one value per class; None weighs all classes alike.
+    `class_weights` are c, one value per class, or how they are computed from the training split
+    (`weights_from`); None weighs all classes alike.
     """
 
-    def __init__(self, *, class_weights: ClassWeights | None) -> None:
-        self.class_weights = class_weights
+    def __init__(
+        self,
+        *,
+        class_weights: ClassWeights | Computed | None,
+        class_pixels: ClassPixels | None = None,
+    ) -> None:
         required = [Requirement("model", "outputs", "scores")]
-        if class_weights is not None:
+        if isinstance(class_weights, str):
+            assert class_pixels is not None, "a run provides the pixels of its training split"
+            class_weights = weights_from(class_pixels(), class_weights)
+        elif class_weights is not None:
             setting = f"loss.class_weights={list(class_weights)}"
             required.append(Requirement("dataset", "num_classes", len(class_weights), setting))
+        self.class_weights = class_weights
         self.record = Record(requires=tuple(required), weighs_confidence=True)
 
     def __call__(
@@ -62,6 +78,30 @@ class CrossEntropy:
         if batch.confidence is not None:
             total = (batch.confidence * total).sum()
         return {"cross_entropy": (total / mean_count(count).clamp(min=TINY)).reshape(1)}
+
+
+def weights_from(pixels: NDArray[np.int64], kind: Computed) -> tuple[float, ...]:
+    """A weight of each class from its pixels in each label (N, K); 0 if it never occurs.
+
+        enet              1 / ln(1.02 + p_c), p_c the share of all pixels
+        median_frequency  median(f) / f_c, f_c the share of the pixels of labels that show c; the
+                          median is that of the classes that occur
+        inverse           1 / (K p_c)
+
+    Source: ENet (Paszke et al., 2016), Sec. 5.2, c = 1.02; Eigen and Fergus (ICCV 2015), semantic
+    labels; the last is the inverse frequency that gives all classes the same sum.
+    """
+    total = pixels.sum(0)
+    share = total / max(total.sum(), 1)
+    if kind == "enet":
+        weights = 1 / np.log(1.02 + share)
+    elif kind == "inverse":
+        weights = 1 / np.maximum(len(share) * share, TINY)
+    else:
+        where = ((pixels > 0) * pixels.sum(1, keepdims=True)).sum(0)
+        frequency = total / np.maximum(where, 1)
+        weights = np.median(frequency[total > 0]) / np.maximum(frequency, TINY)
+    return tuple(np.where(total > 0, weights, 0.0).tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,5 +132,5 @@ class WithAuxiliary:
 
 
 def single(values: Tensor) -> Tensor:
-    """At least float32: sums over millions of pixels are kept in it under autocast too."""
+    """The tensor in float32 at least, so that autocast does not sum millions of pixels in less."""
     return values.to(torch.promote_types(values.dtype, torch.float32))

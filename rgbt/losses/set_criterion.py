@@ -29,8 +29,8 @@ from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.types import IGNORE, Batch, Output
 
+# Size of the largest temporary of a step. A larger one does not fit in the processor's cache.
 CHUNK_BYTES = 16 * 2**20
-"""About what the largest temporary of a step may take. Larger ones leave the processor's cache."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -98,7 +98,7 @@ class SetCriterion:
         return self.compare(output, batch, Points(generator, device=batch.label.device))
 
     def compare(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
-        """As `__call__`, at given points."""
+        """Compare as `__call__` does, at given points."""
         layers = self.layers(output, batch, points)
         return {name: weight * layers[name].sum(0) for name, weight in self.part_weights.items()}
 
@@ -271,7 +271,7 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
     parts = [cost.flatten(), whole(targets.present).flatten(), targets.unknown.reshape(1)]
     numbers = torch.cat([part.float() for part in parts]).cpu().numpy()
     cost_SBQK = numbers[: cost.numel()].reshape(cost.shape)
-    # Of the images of all processes.
+    # This covers the images of all processes.
     present_BK = numbers[cost.numel() : -1].reshape(-1, targets.present.shape[1]) > 0
     if numbers[-1]:
         raise ValueError(

@@ -142,8 +142,8 @@ def pseudo_labels(
     return PseudoLabels(label, weights.contiguous(), of_batch, mean_count(confidence.mean()))
 
 
+# Input of a discriminator, derived from a prediction.
 Judged = Literal["probabilities", "logits", "self_information"]
-"""Input of a discriminator, derived from a prediction."""
 
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:

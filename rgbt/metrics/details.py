@@ -35,7 +35,7 @@ KINDS: tuple[DetailKind, ...] = get_args(DetailKind)
 
 BOTH, LABEL, PREDICTED = range(3)
 NUMBER, CORRECT, CONFIDENCE = range(3)
-OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")  # need `rgbt.types.SceneMaps`
+SCENE_KINDS: tuple[DetailKind, ...] = ("distance", "size")  # need `rgbt.types.SceneMaps`
 WIDTH: Final = 0.02  # of a boundary, share of the image diagonal (Cheng et al., Sec. 4)
 DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
     "boundary": (WIDTH,),
@@ -44,9 +44,9 @@ DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
     "size": (64.0, 256.0, 1024.0),  # squares of 8, 16 and 32 pixels
 }
 MOST_EDGES: Final = 20
+# Units of a confidence of 1, to which that of a pixel is rounded, so that all counts are integers;
+# this changes an error by at most 0.005 percent points.
 UNITS: Final = 10_000
-"""Units of a confidence of 1, to which that of a pixel is rounded, so that all counts are integers;
-this changes an error by at most 0.005 percent points."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Details:
     def __post_init__(self) -> None:
         if self.kind == "boundary":
             check_range("boundary_width", self.setting[0], 0.001, 0.2)
-        elif self.kind in OF_SCENES:
+        elif self.kind in SCENE_KINDS:
             rising = all(low < high for low, high in self._edges())
             if not rising or not 1 <= len(self.setting) <= MOST_EDGES:
                 given = f"{self.kind}s={','.join(map(_text, self.setting))}"
@@ -76,7 +76,7 @@ class Details:
     @property
     def bins(self) -> tuple[str, ...]:
         """Names of the bins of distance and size: "0-10", "10-20", "20-inf"; else ()."""
-        if self.kind not in OF_SCENES:
+        if self.kind not in SCENE_KINDS:
             return ()
         return tuple(f"{_text(low)}-{_text(high)}" for low, high in self._edges())
 
@@ -87,7 +87,7 @@ class Details:
 
     def measures(self, num_classes: int) -> int:
         """M, second last dimension of the counts."""
-        return num_classes if self.kind in OF_SCENES else 3
+        return num_classes if self.kind in SCENE_KINDS else 3
 
     def partition(self, regions: str) -> str:
         """Name of the partition of such counts; `regions` is that of the regions: "ring5"."""
@@ -111,7 +111,7 @@ def requested(
         setting = DEFAULTS[kind]
         if kind == "boundary":
             setting = (boundary[0], *([1.0] if boundary[1] else []))
-        elif kind in OF_SCENES:
+        elif kind in SCENE_KINDS:
             text = distances if kind == "distance" else sizes
             try:
                 setting = tuple(map(float, split_list(text, f"{kind}s")))

@@ -22,10 +22,10 @@ from rgbt.metrics.details import KINDS, DetailKind, details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import MEANS, Matrices, Scores
 
+# Counts -> fractions (..., K).
 ByClass = Callable[[Matrices, Absent], Scores]
-"""Counts -> fractions (..., K)."""
 
-OF_PAIRS: dict[str, ByClass] = {
+PAIR_SCORES: dict[str, ByClass] = {
     names.TC: pairs.tc,
     names.CA: pairs.ca,
     names.CA_RELEASED: pairs.ca_released,
@@ -36,30 +36,30 @@ CHANGES: dict[str, Callable[[Matrices], tuple[Scores, Scores]]] = {
     names.FLICKER: pairs.flickered,
 }
 SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
-    "aligned": (*OF_PAIRS, names.WARPING_ERROR),
-    "released": tuple(OF_PAIRS),
-    "next": (*OF_PAIRS, names.WARPING_ERROR),
-    "flow": (*OF_PAIRS, names.WARPING_ERROR),
+    "aligned": (*PAIR_SCORES, names.WARPING_ERROR),
+    "released": tuple(PAIR_SCORES),
+    "next": (*PAIR_SCORES, names.WARPING_ERROR),
+    "flow": (*PAIR_SCORES, names.WARPING_ERROR),
     "triples": (names.FLICKER,),
 }
-BY_CLASS: dict[str, ByClass] = {
+CLASS_SCORES: dict[str, ByClass] = {
     **{"IoU": scores.iou, "acc": scores.recall, names.DISTANCE: scores.iou},
     **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.boundary_iou),
     names.SIZE: lambda counts, _: scores.object_recall(counts),
 }
 SINGLE, PAIRS = "single frames", "pairs of frames"
 EVERYWHERE = ("", "region", "class", "class region")
+# Score -> the counts that have it, and what may be named before it.
 SCORES: dict[str, tuple[str, tuple[str, ...]]] = {
     **dict.fromkeys((*MEANS, names.VAR), (SINGLE, ("",))),
     "acc": (SINGLE, ("class",)),
-    **dict.fromkeys((*OF_PAIRS, *CHANGES), (PAIRS, ("", "class"))),
+    **dict.fromkeys((*PAIR_SCORES, *CHANGES), (PAIRS, ("", "class"))),
     names.BOUNDARY_MIOU: ("boundary", ("", "region")),
     names.BOUNDARY_IOU: ("boundary", ("class", "class region")),
     names.ECE: ("calibration", EVERYWHERE),
     names.DISTANCE: ("distance", EVERYWHERE),
     names.SIZE: ("size", EVERYWHERE),
 }
-"""Score -> the counts that have it, and what may be named before it."""
 
 NAME = re.compile(
     r"((?P<part>day|night)/)?(class/(?P<name>[^/]+)(/|$))?(region/(?P<region>[1-9]\d*)(/|$))?"
@@ -144,7 +144,7 @@ def values(
             for each in CHANGES[parsed.score](by_region)
         )
         return 100.0 * np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
-    if parsed.score in OF_PAIRS:
+    if parsed.score in PAIR_SCORES:
         return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))
     if parsed.score == names.VAR:
         return scores.variance(scores.miou(by_region, absent, like.scored))
@@ -156,16 +156,16 @@ def values(
     group = chosen[..., details.bins.index(parsed.bin) if details and parsed.bin else 0, :, :]
     if parsed.score in MEANS:
         return 100.0 * MEANS[parsed.score](group, absent, like.scored)
-    return 100.0 * mean_or_class(BY_CLASS[parsed.score](group, absent))
+    return 100.0 * mean_or_class(CLASS_SCORES[parsed.score](group, absent))
 
 
 def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
-    """A score of `OF_PAIRS` by class (..., K); CA along an estimated flow is of labelled pixels."""
+    """A score of `PAIR_SCORES` by class (..., K); CA along estimated flow uses labelled pixels."""
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
         known = pairs.only_labelled(by_region)
         without = np.isnan(known[..., :1, 0, 0])
-        return np.where(without, np.nan, OF_PAIRS[score](np.nan_to_num(known), absent))
-    return OF_PAIRS[score](by_region, absent)
+        return np.where(without, np.nan, PAIR_SCORES[score](np.nan_to_num(known), absent))
+    return PAIR_SCORES[score](by_region, absent)
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:

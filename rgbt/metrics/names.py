@@ -15,16 +15,16 @@ MPRECISION = "mPrecision"
 MF1 = "mF1"
 PIXEL_ACCURACY = "pixel_accuracy"  # share of the valid pixels that are right
 
-# Of pairs of frames, see `rgbt.metrics.pairs`.
+# Scores of pairs of frames, see `rgbt.metrics.pairs`.
 TC = "TC"  # mean over classes of the temporal consistency (Temporal, Fig. 4)
 CA = "CA"  # mean over classes of the consistent accuracy, over the exact union of three sets
 CA_RELEASED = "CA_released"  # the same over the union that the Temporal release computes
 WARPING_ERROR = "warping_error"  # share of the pixels seen in both frames whose class changes
 FLICKER = "flicker"  # share of the pixels seen in three frames whose class changes and changes back
 
-# Of details, see `rgbt.metrics.details`.
+# Scores of details, see `rgbt.metrics.details`.
 BOUNDARY_MIOU = "boundary_mIoU"
-BOUNDARY_IOU = "boundary_IoU"  # of one class
+BOUNDARY_IOU = "boundary_IoU"  # boundary score of one class
 ECE = "ECE"  # expected calibration error
 DISTANCE = "distance"
 SIZE = "size"

@@ -13,8 +13,8 @@ from rgbt.files.plain_files import read_json
 
 PAIR_LIST = "pairs.json"
 
+# Kind of the second frames: virtual views, stored beside the first, or the next of a video.
 Frames = Literal["virtual", "next", "video"]
-"""Second frames: virtual views, true ones that are stored beside the first, or of a video."""
 
 
 @dataclass(frozen=True)

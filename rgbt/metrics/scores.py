@@ -136,6 +136,12 @@ def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
     }
 
 
+def absent_rule(absent: Absent) -> str:
+    """How classes without a pixel count, for below a table."""
+    counted = {"released": "counts as 0", "exclude": "is left out of means"}[absent]
+    return f"A class without a pixel {counted} (absent={absent})."
+
+
 def absent_notes(
     by_region: NDArray[np.integer],
     classes: Sequence[str],

@@ -115,7 +115,7 @@ class CMNeXt(CmxNetwork):
     Source: J. Zhang et al., Delivering Arbitrary-Modal Semantic Segmentation, CVPR 2023.
     Released: jamycheung/DELIVER. With two modalities its self-query hub does not exist.
 
-    The arguments are the keys of ``conf/model/cmnext_b2.yaml``.
+    The arguments are the keys of ``conf/model/cmnext.yaml``.
     """
 
     # ImageNet's file covers the RGB stream alone.

@@ -122,7 +122,7 @@ class Network(nn.Module):
         generator: torch.Generator | None = None,
         **options: Any,
     ) -> Output:
-        """As `rgbt.models` says; `options` are further arguments of `predict`."""
+        """Predict as `rgbt.models` says; `options` are further arguments of `predict`."""
         view = only_view(views, self.record.views, type(self).__name__)
         images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
         logits, aux = self.predict(images, view, generator, **options)

@@ -17,11 +17,11 @@ from rgbt.checks import InputError
 from rgbt.processes import num_processes, own
 from rgbt.ranges import ShareBelowOne
 
+# Channel dropout before the first block, and after every block.
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
-"""Channel dropout before the first block, and after every block."""
 
+# Factors of the two residuals of a block, (2, N, 1, 1, 1); None where nothing is dropped.
 Keep = Tensor | tuple[None, None]
-"""Factors of the two residuals of a block, (2, N, 1, 1, 1); None where nothing is dropped."""
 
 ALL_KEPT = (None, None)
 StrideAt = Literal["1x1", "3x3"]

@@ -18,6 +18,7 @@ from rgbt.ranges import BaseWidth, NumClasses
 from rgbt.requirements import Record
 from rgbt.types import Output, View
 
+# Depth of a ResNet -> blocks of its stages (He et al., Table 1).
 BLOCKS = {
     18: (2, 2, 2, 2),
     34: (3, 4, 6, 3),
@@ -25,7 +26,6 @@ BLOCKS = {
     101: (3, 4, 23, 3),
     152: (3, 8, 36, 3),
 }
-"""Depth of a ResNet -> blocks of its stages (He et al., Table 1)."""
 
 BASIC = (18, 34)  # the others have bottlenecks, which end in four times as many channels
 
@@ -70,7 +70,7 @@ class RTFNet(Network):
 
     Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
 
-    The arguments are the keys of ``conf/model/rtfnet_50.yaml``. A thermal stem of three channels
+    The arguments are the keys of ``conf/model/rtfnet.yaml``. A thermal stem of three channels
     starts as a copy of RGB's instead of its mean; `thermal_stem` holds for ImageNet's weights too.
     """
 

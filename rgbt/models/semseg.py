@@ -117,7 +117,7 @@ def _conv_norm(before: int, after: int, *, stride: int = 1) -> tuple[nn.Module, 
 
 
 def _head(channels: int, narrow: int, num_classes: int) -> nn.Sequential:
-    """As semseg numbers the layers: 3 is its dropout, which `forward` draws."""
+    """The layers with semseg's numbers: 3 is its dropout, which `forward` draws."""
     return nn.Sequential(
         *_conv_norm(channels, narrow), nn.Identity(), nn.Conv2d(narrow, num_classes, 1)
     )

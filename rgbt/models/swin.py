@@ -21,7 +21,7 @@ PATCH = 4
 
 @dataclass(frozen=True)
 class SwinShape:
-    """Sizes of one branch; keys of ``conf/model/mask2former_swin_t.yaml``."""
+    """Sizes of one branch; keys of ``conf/model/mask2former.yaml``."""
 
     embed_dim: int
     depths: tuple[int, int, int, int]

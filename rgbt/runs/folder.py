@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,9 +29,9 @@ Kind = Literal["train", "val", "test"]
 
 ADVICE = "restore it from a copy, or remove the run's folder to train it again"
 
+# Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
+# and the tag that the seeds of one configuration share.
 REPLACED, REPLACED_TAG, GROUP = "replaced", "rgbt.replaced", "rgbt.group"
-"""Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
-and the tag that the seeds of one configuration share."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,23 @@ class Description:
     tags: dict[str, str]
     params: dict[str, str]
     overrides: list[str] = field(default_factory=list)
+
+
+def lists_of(params: Mapping[str, str]) -> str:
+    """Which lists a run was trained and its checkpoint selected on, of its parameters.
+
+    "trained on train.txt + val.txt, selected on val.txt"; a split without a list by its name.
+    """
+
+    def named(split: str) -> str:
+        lists = (params.get(f"dataset.{key}.{split}") for key in ("splits", "lists", "folders"))
+        found = next(filter(None, lists), split)
+        return " + ".join(re.findall(r"[^\[\]', ]+", found)) if found[0] == "[" else found
+
+    selected = f"selected on {named(params.get('trainer.selection_split', 'val'))}"
+    if params.get("trainer.tested") == "last":
+        selected = "last checkpoint"
+    return f"trained on {named(params.get('domains.source.split', 'train'))}, {selected}"
 
 
 class MarkerForm(TypedDict):

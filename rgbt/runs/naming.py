@@ -13,27 +13,27 @@ from collections.abc import Mapping
 
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
-from rgbt.runs.folder import GROUP, Description
+from rgbt.runs.folder import GROUP, Description, lists_of
 from rgbt.runs.run_spec import RunSpec
 
+# Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it.
 TAGS = "RGBT_TAGS"
-"""Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it."""
 
+# Tag with the keys in which the points of a sweep differ, separated by spaces.
 VARIED = "rgbt.varied"
-"""Tag with the keys in which the points of a sweep differ, separated by spaces."""
 
+# Characters of a value in a name; a longer one, such as a path, is cut in the middle.
 VALUE_LENGTH = 32
-"""Characters of a value in a name; a longer one, such as a path, is cut in the middle."""
 
 SILENT = (
     *("experiment", "search", "runs_dir", "tracking", "dataset.root", "model.checkout", "name"),
     *("seed", "fresh"),
 )
-OF_MACHINE = ("runs_dir=", "tracking", "dataset.root=", "out=", "fresh=", "hydra")
-"""Beginnings of overrides that are of no use on another machine."""
+# Beginnings of overrides that are of no use on another machine.
+MACHINE_OVERRIDES = ("runs_dir=", "tracking", "dataset.root=", "out=", "fresh=", "hydra")
 
-BESIDE = ("tracking.", "consistency")
-"""Extra measurements and trackers are not part of the run."""
+# Beginnings of overrides for extra measurements and trackers, which are not part of the run.
+EXTRA_MEASUREMENTS = ("tracking.", "consistency")
 
 
 def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Description:
@@ -52,15 +52,16 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
         # Paths and passwords of the tracker are no property of the run.
         if not key.endswith("_target_") and not key.startswith("tracking.") and key != "fresh"
     }
-    # In typed order; of a key that was typed twice the last value counts, a reference by its value.
+    # The order is as typed; the last value of a key counts, and a reference by its value.
     words = {}
     for key, equals, value in (word.lstrip("+").partition("=") for word in spec.overrides):
-        if key not in SILENT and not key.rpartition("@")[2].startswith(BESIDE):
+        if key not in SILENT and not key.rpartition("@")[2].startswith(EXTRA_MEASUREMENTS):
             words[key] = f"{key}{equals}{params.get(key, value) if '${' in value else value}"
     tags = {
         "rgbt.experiment": spec.name,
         GROUP: " ".join([spec.name, *words.values()]),
         "rgbt.seed": str(spec.seed),
+        "rgbt.lists": lists_of(params),
         **(extra_tags or {}),
     }
     # What varies, a dot, and what does not; outside of a sweep everything may vary.
@@ -72,7 +73,9 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
     name = f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
     if "experiment" in varied:
         name = " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
-    command = [word for word in spec.overrides if not word.lstrip("+").startswith(OF_MACHINE)]
+    command = [
+        word for word in spec.overrides if not word.lstrip("+").startswith(MACHINE_OVERRIDES)
+    ]
     return Description(name, tags, params, command)
 
 

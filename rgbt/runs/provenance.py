@@ -28,8 +28,8 @@ COMMIT_LENGTH = 10
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
+# Characters of uncommitted changes that are kept; a longer diff ends with a line that says so.
 DIFF_LIMIT = 2_000_000
-"""Characters of uncommitted changes that are kept; a longer diff ends with a line that says so."""
 
 HIDDEN = "***"
 

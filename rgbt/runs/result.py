@@ -15,14 +15,15 @@ from rgbt.runs.folder import (
     Description,
     counts_name,
     is_finished,
+    lists_of,
     read_description,
     read_provenance,
     read_result,
 )
 from rgbt.runs.provenance import commit_of, other_code
 
+# The checkpoint of evaluations, and the pattern of the counts that a run ended with.
 CHECKPOINT, ALL_COUNTS = "best.pt", "counts_*.npz"
-"""The checkpoint of evaluations, and the pattern of the counts that a run ended with."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class RunResult:
 
     @property
     def fingerprint(self) -> str:
-        """Of the data set that the run was made on."""
+        """Fingerprint of the data set that the run was made on."""
         return str(self.result["dataset"])
 
     @property
@@ -75,6 +76,12 @@ class RunResult:
     def tags(self) -> dict[str, str]:
         """Tags by name."""
         return self.description.tags
+
+    @property
+    def lists(self) -> str:
+        """Which lists it was trained and selected on, in words; "" without ``run.json``."""
+        params = self.description.params
+        return lists_of(params) if params else ""
 
     @property
     def provenance(self) -> list[dict[str, Any]]:

@@ -25,15 +25,15 @@ from rgbt.config.values import check_value
 from rgbt.data.domains import GIVEN, NONE, Domain, Domains
 from rgbt.data.loader_settings import LOADING, LoaderSettings
 from rgbt.engine.prediction import Prediction
-from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
+from rgbt.engine.settings import MACHINE_SETTINGS, Recipe, Scale, TrainerSettings
 from rgbt.files.atomic import is_held
 from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code
 
+# The setting that names the weights that a network starts from.
 WEIGHTS = "model.weights"
-"""The setting that names the weights that a network starts from."""
 
 CheckpointFile = Literal["best.pt", "last.pt"]
 
@@ -176,8 +176,15 @@ class RunSpec:
     schedule = Node(Component)
     trainer = Node(
         TrainerSettings,
-        outside_key=OF_MACHINE,
-        shared=("max_steps", "eval_every", "precision", "threads", "batch_norm_parts", *OF_MACHINE),
+        outside_key=MACHINE_SETTINGS,
+        shared=(
+            "max_steps",
+            "eval_every",
+            "precision",
+            "threads",
+            "batch_norm_parts",
+            *MACHINE_SETTINGS,
+        ),
     )
     metric = Node(Component, shared=True)
     prediction = Node(Prediction)
@@ -186,12 +193,12 @@ class RunSpec:
 
     @property
     def name(self) -> str:
-        """Of the experiment."""
+        """Name of the experiment."""
         return str(self.plain["name"])
 
     @property
     def seed(self) -> int:
-        """Of every generator, but for those that `seeds` names."""
+        """Seed of every generator, but for those that `seeds` names."""
         return int(self.plain["seed"])
 
     def check(self) -> RunSpec:
@@ -421,18 +428,20 @@ def _plain_numbers(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+# Every node of the configuration with its policy.
 NODES: dict[str, Node[Any]] = {
     name: node for name, node in vars(RunSpec).items() if isinstance(node, Node)
 }
-"""Every node of the configuration with its policy."""
 
+# Dotted keys in which two configurations of one run may differ.
 NOT_IN_KEY = (
     *("name", "runs_dir", "out"),
     *(key for key, node in NODES.items() if not node.in_key),
     *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
 )
-"""Dotted keys in which two configurations of one run may differ."""
 
+# Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
+# the scale. A duration is that of the scale unless it was typed.
 SHARED = (
     *("seed", "runs_dir", "pretrained"),
     *(key for key, node in NODES.items() if node.shared is True),
@@ -443,9 +452,9 @@ SHARED = (
         for each in node.shared
     ),
 )
-"""Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
-the scale. A duration is that of the scale unless it was typed."""
 
+# Dotted keys that a common upstream run takes over from the run that needs it first. None of them
+# enters the run key, so that it is one run for all seeds and data sets.
 SHARED_BY_COMMON = (
     *(key for key in SHARED if key in NOT_IN_KEY),
     *(
@@ -455,5 +464,3 @@ SHARED_BY_COMMON = (
         for each in node.outside_key
     ),
 )
-"""Dotted keys that a common upstream run takes over from the run that needs it first. None of them
-enters the run key, so that it is one run for all seeds and data sets."""

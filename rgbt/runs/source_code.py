@@ -22,25 +22,25 @@ from typing import Any
 from rgbt.config.stored_config import EXTERNAL, targets
 from rgbt.files.adapters import adapter_of
 
+# Packages whose targets do not count: their versions are in ``provenance.json``.
 RELEASED = ("rgbt", "torch")
-"""Packages whose targets do not count: their versions are in ``provenance.json``."""
 
+# Packages that are not the user's: ours may be in a working tree and not installed.
 SHIPPED = (*RELEASED, "sweeps", "analysis", "hydra_plugins")
-"""Packages that are not the user's: ours may be in a working tree and not installed."""
 
 INSTALLED = {"site-packages", "dist-packages"}
 
+# Prefix of the names of a checkout's modules, which may be names of the user's own.
 PREFIX = "checkout/"
-"""Before the names of the modules of a checkout, which may be those of the user's own."""
 
+# Name of a recipe's adapter among these modules.
 ADAPTER = "adapter"
-"""Name of the adapter of a recipe among them."""
 
+# Name of a module and SHA-256 of its code, or name and version of an installed distribution.
 Used = tuple[str, str]
-"""Name of a module and SHA-256 of its code, or name and version of an installed distribution."""
 
+# Digests of the code of each module when this process first read it.
 _used_by: dict[str, tuple[Used, ...]] = {}
-"""Digests of the code of each module when this process first read it."""
 
 
 def user_code(named: Iterable[str]) -> tuple[Used, ...]:

@@ -41,22 +41,22 @@ from rgbt.runs.run_spec import (
     labels_key,
 )
 
+# Prefixes of the name of an upstream run; a common one keeps its own seed and data set.
 PREFIX, COMMON_PREFIX = "experiment:", "common:"
-"""Before the name of an upstream run; a common one keeps its own seed and data set."""
 
+# Setting of an embedded data set: where the generated images are.
 CACHE = "cache_dir"
-"""Setting of an embedded data set: where the generated images are."""
 
+# Setting that names the folder of another author's code.
 CHECKOUT = "model.checkout"
-"""Setting that names the folder of another author's code."""
 
 GROUPS = ("dataset", "metric", "prediction", "consistency")
+# Settings of a finished run that may be changed: the source of the images and the counting, and
+# where code lies.
 CHANGEABLE = (
     *(*GROUPS, "data", "transform.test_short_edge"),
     *("trainer.accelerator", "trainer.threads", "trainer.precision", CHECKOUT),
 )
-"""Settings of a finished run that may be changed: the source of the images and the counting, and
-where code lies."""
 
 
 def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:

@@ -69,7 +69,7 @@ class CRM:
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase: the criterion of the supervised passes and the distillation terms."""
-        # In a function of its own, so that the backward pass does not keep the mask logits.
+        # This is a function of its own, so that the backward pass does not keep the mask logits.
         yield Phase(("main",), self._parts(batch, generator_of))
 
     def _parts(self, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:

@@ -12,15 +12,14 @@ from rgbt.processes import own, whole
 from rgbt.requirements import Record, Requirement
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase, View
 
+# The gradients with which the optimizers of two heads step their shared parameters.
+#
+#     apart      each with the gradient of its own domain
+#     kept       the source's with its own, then the target's with both, the source's from before
+#                that step (thesis' code, stage with labels on both domains: nothing is cleared)
+#     together   both with the sum of both, one after the other (thesis' code, adversarial stage),
+#                so that shared parameters are stepped twice
 Gradients = Literal["apart", "kept", "together"]
-"""The gradients with which the optimizers of two heads step their shared parameters.
-
-    apart      each with the gradient of its own domain
-    kept       the source's with its own, then the target's with both, the source's from before
-               that step (thesis' code, stage with labels on both domains: nothing is cleared)
-    together   both with the sum of both, one after the other (thesis' code, adversarial stage),
-               so that shared parameters are stepped twice
-"""
 
 WHOLE_IMAGES = Requirement("masker", "hides_cells", False)  # of a scheme without a masked pass
 
@@ -86,7 +85,7 @@ class Passes:
     def record_with(
         self, *requires: Requirement, masked: Requirement = WHOLE_IMAGES, **provides: Any
     ) -> Record:
-        """Of a scheme of two domains and class scores; `masked` is required of the masker."""
+        """The record of a scheme of two domains and class scores; the masker must be `masked`."""
         heads = ("domains", "separate_heads", True, f"scheme.gradients={self.gradients}")
         return Record(
             requires=(

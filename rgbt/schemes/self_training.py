@@ -25,9 +25,9 @@ from rgbt.schemes.domains import Passes, SourceAndTarget, draw_masks, scores
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains, View
 
 TEACHER = "teacher"
+# Names in the log: share of the target's pixels whose highest probability reaches the threshold,
+# and the mean of the highest probabilities.
 CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
-"""Names in the log: share of the target's pixels whose highest probability reaches the threshold,
-and the mean of the highest probabilities."""
 
 NUM_VALUES = 256  # of a label: the classes and 255, which is pasted like a class
 LUMA = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)

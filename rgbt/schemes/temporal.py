@@ -33,7 +33,7 @@ class Temporal:
     The loss is one of two frames (`rgbt.losses.temporal.TemporalLoss`), the view draws and applies
     virtual views (`rgbt.transforms.views.VirtualView`). At the resolution "half", the scores of
     both frames are averaged over 2x2 pixels and these means are compared. A mean counts where all
-    of its pixels do. The settings are the keys of ``conf/scheme/temporal_paper.yaml``.
+    of its pixels do. The settings are the keys of ``conf/scheme/temporal.yaml``.
     """
 
     model: nn.Module

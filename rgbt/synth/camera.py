@@ -24,11 +24,11 @@ def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
     return np.array(values, np.float32)
 
 
+# Seed and index of a scene.
 Key = tuple[int, int]
-"""Seed and index of a scene."""
 
+# Nothing nearer than this along the optical axis is drawn.
 NEAR_M = 0.3
-"""Nothing nearer than this along the optical axis is drawn."""
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ def _ids(table: Table, scene: Scene) -> NDArray[np.uint8]:
     return ids
 
 
+# Depth of the sky in a file, and of anything farther than 655 m.
 SKY = 65535
-"""Depth of the sky in a file, and of anything farther than 655 m."""
 
 
 class SceneDataset(MFNet):
@@ -131,18 +131,18 @@ MFNET_LAYOUT = Layout(_mfnet_named, _mfnet_images, _mfnet_lists)
 
 
 _FRAMES_PER_VIDEO = 40
+# (split, night) -> recordings that the CRM release gives to it.
 _SETS = {
     **{("train", False): (0, 1, 2), ("train", True): (3, 4, 5)},
     **{("val", False): (6,), ("val", True): (10,)},
     **{("test", False): (7, 8), ("test", True): (9, 11)},
 }
-"""(split, night) -> recordings that the CRM release gives to it."""
 
+# Id of pixels without a class, after the last class; training and scores ignore it.
 VOID = "void"
-"""What has no class: the id after the last one, ignored in training and in every score."""
 
+# Class of MFNet's labels 1 to 8; a person on a bicycle is a "rider".
 _KP_LABELS = ("car", "person", "bicycle", "sidewalk", VOID, "fence", VOID, "road")
-"""Class of MFNet's labels 1 to 8; a person on a bicycle is a "rider"."""
 
 KP_TABLE = class_table([*kp.CLASSES, VOID], _KP_LABELS, "kp")
 
@@ -212,18 +212,18 @@ def kp_ids(scene: Scene) -> NDArray[np.uint8]:
     return np.where(on_bike, np.uint8(kp.CLASSES.index("rider")), ids)
 
 
+# The recording of the training part that scenes for validation lie in.
 VAL_BAG = 20
-"""The recording of the training part that scenes for validation lie in."""
 
+# Recordings of each split; those for testing are the real ones.
 _BAGS = {"train": range(1, VAL_BAG), "val": (VAL_BAG,), "test": (21, 22, 23, 24, 25)}
-"""Recordings of each split; those for testing are the real ones."""
 
 _FRAME_STEP = 10
+# Which object of a street stands for which of the four; others are background.
 _STANDS_FOR = {
     **{COLOR_CONE: "fire_extinguisher", CAR_STOP: "backpack"},
     **{BUMP: "hand_drill", PERSON: "survivor"},
 }
-"""Which object of a street stands for which of the four; others are background."""
 
 PST900_IDS = np.array(
     [pst900.CLASSES.index(_STANDS_FOR.get(label, "background")) for label in range(9)], np.uint8
@@ -277,17 +277,17 @@ PST900_LAYOUT = Layout(_pst900_named, _pst900_images)
 
 
 VAL_SEQUENCE = "seq_04_day"
+# Sequences of each split, and pieces of each of them.
 _SEQUENCES, _PIECES = {"train_day": 4, "train_night": 3}, 2
-"""Sequences of each split, and pieces of each of them."""
 
+# The sequence whose labels are twice the size of its frames.
 _LARGE_LABELS = "train/seq_01_day/"
-"""The sequence whose labels are twice the size of its frames."""
 
+# Counts of the grey levels 0 and 1, which some pixels lie beyond.
 BLACK, WHITE = 21800, 23700
-"""Counts of the grey levels 0 and 1, which some pixels lie beyond."""
 
+# Corners (share of the width, of the height) of what the thermal camera sees.
 _MARGINS = ((0.151, 0.0), (0.172, 1.0), (0.826, 1.0), (0.845, 0.0))
-"""Corners (share of the width, of the height) of what the thermal camera sees."""
 
 _FREIBURG_LABELS = ["car", "person", "bicycle", "curb", "background", "fence", "background", "road"]
 FREIBURG_TABLE = class_table(freiburg.CLASSES, _FREIBURG_LABELS, "freiburg")
@@ -361,7 +361,7 @@ def _freiburg_images(scene: Scene, shot: Shot) -> Images:
     if shot.split == "test":
         rgb, thermal = ("ImagesRgb", "ImagesIr") if shot.night else ("ImagesRGB", "ImagesIR")
         of_thermal = stamp if shot.night else stamp.removesuffix("0")
-        # By hand only that is labelled which both cameras see.
+        # People label only what both cameras see.
         label = np.where(counts > 0, ids, np.uint8(freiburg.CLASSES.index("ignore")))
         return {
             f"{folder}/{rgb}/{stamp}_rgb.png": _bgr(scene),

@@ -26,20 +26,20 @@ from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.light import is_night
 from rgbt.synth.scene import Scene, render_pair, render_scene
 
+# Version of the files. Raise it with every change of a byte, so that no cache is stale.
 VERSION = 3
-"""Of the files. Raise it with every change that changes a byte, so that no cache is stale."""
 
+# Numbers of scenes: fewer are written before a pool has started, or in less than a second.
 _WORTH_A_POOL, _WORTH_A_BAR = 200, 100
-"""Scenes: fewer are written before a pool has started, or in less than a second."""
 
+# A third of the time of the quickest ordinary compression, and smaller: the images are noisy.
 _FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-"""A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
 
+# Path in the data set -> image in OpenCV's order of channels, or array if the path says .npy.
 Images = dict[str, NDArray[Any]]
-"""Path in the data set -> image in OpenCV's order of channels, or array if the path says .npy."""
 
+# Folder of the second frames, in the same layout, with flow/NAME.npy.
 FRAMES = "next"
-"""Folder of the second frames, in the same layout, with flow/NAME.npy."""
 
 
 @dataclass(frozen=True, kw_only=True)

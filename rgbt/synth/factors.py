@@ -14,8 +14,8 @@ from rgbt.ranges import Share
 
 Made = TypeVar("Made")
 
+# Number of scenes of a split; their names have five digits.
 NumScenes = Annotated[int, Interval(ge=1, le=30_000)]
-"""Of a split; names have five digits."""
 
 Side = Annotated[int, Interval(ge=32, le=2048), doc("pixels")]
 Strength = Annotated[float, Interval(ge=0, le=4)]

@@ -108,8 +108,8 @@ def _night(light: Light, u: list[float], factor: float) -> Light:
 
 
 _MAX_LAMPS = 6
+# A lamp that lights its surroundings: position, colour times strength, reach in metres.
 Lamp = tuple[tuple[float, float, float], Floats, float]
-"""A lamp that lights its surroundings: position, colour times strength, reach in metres."""
 
 
 def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
@@ -160,8 +160,8 @@ def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
 
 _SUN, _HEADLAMP = floats([1.0, 0.95, 0.85]), floats([1.0, 0.97, 0.90])
 _SUN_SHARE = 0.33
+# Distance at which a veil has half its strength, as a share of the image width.
 _REACH = 0.16
-"""Distance at which a veil has half its strength, as a share of the image width."""
 
 
 def veil_of(

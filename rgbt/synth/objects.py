@@ -32,12 +32,12 @@ _CAR_PAINTS, _CLOTHES, _FACADES = map(paints, ("car", "clothes", "facade"))
 _STOPS = ("stop_block", "stop_bollard", "stop_cube")
 
 _NEAR_SHARES = {"demo": (0.22, 0.45, 0.73, 0.87, 1.0), "mfnet": (0.30, 0.54, 0.78, 0.90, 1.0)}
+# Object mix -> cumulative shares of the kinds, in the order of `_GROUPS`.
 _FAR_SHARES = {"demo": (0.34, 0.72, 0.82, 0.88, 1.0), "mfnet": (0.15, 0.62, 0.80, 0.90, 1.0)}
-"""Object mix -> cumulative shares of the kinds, in the order of `_GROUPS`."""
 
 _FAR_Z = (26.0, 90.0)
+# (Z, lateral position) in metres.
 At = tuple[float, float]
-"""(Z, lateral position) in metres."""
 
 
 def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> list[Placed]:
@@ -234,11 +234,11 @@ def _cones(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
     return [road.place("cone", *place, scale=size) for place in places]
 
 
+# Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left).
 _GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[Placed]]], ...] = (
     *((6.5, 26, _cars), (4.5, 18, _persons), (3.8, 13, _bikes)),
     *((3.6, 11, _stops), (3.6, 12, _cones)),
 )
-"""Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left)."""
 
 
 _LAST_Z, _FAR_TREE_M = 85.0, 22.0
@@ -291,8 +291,8 @@ def _plots(road: Road, rows: list[Row], side: int) -> list[Placed]:
     return placed
 
 
+# Middle (Z), length, lateral position of the edge towards the road (signed).
 Plot = tuple[float, float, float]
-"""Middle (Z), length, lateral position of the edge towards the road (signed)."""
 
 
 def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:

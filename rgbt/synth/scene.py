@@ -31,8 +31,8 @@ from rgbt.synth.surface import (
     surface_of,
 )
 
+# Glow is stored in eight bits up to this brightness.
 _GLOW_RANGE = 4.0
-"""Glow is stored in eight bits up to this brightness."""
 
 _GLASS = floats([0.035, 0.045, 0.055])[:, None, None]
 _WINDOW_GLOW = floats([0.95, 0.80, 0.48])[:, None, None]
@@ -41,11 +41,11 @@ _RGB_TEXTURES, _HEAT_TEXTURES = column("rgb_texture"), column("heat_texture")
 _DAY, _NIGHT, _HEAT = (column(name) for name in ("day", "night", "heat"))
 _PASSIVE = column("passive") > 0
 
+# Range in degrees above the air that eight bits per facet cover.
 _COLDEST, _SPAN = -45.0, 95.0
-"""Range in degrees above the air that eight bits per facet cover."""
 
+# Grey level (1 = full scale) of air temperature, and per degree, as MFNet's camera shows them.
 _LEVEL, _PER_DEGREE = 0.21, 0.026
-"""Grey level (1 = full scale) of air temperature, and per degree, as MFNet's camera shows them."""
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,14 @@ from rgbt.randomness import numpy_generator
 from rgbt.synth.camera import Floats, floats
 from rgbt.synth.factors import SceneFactors
 
+# MFNet's label ids.
 UNLABELED, CAR, PERSON, BIKE, CURVE, CAR_STOP, GUARDRAIL, COLOR_CONE, BUMP = range(9)
-"""MFNet's label ids."""
 
+# Reflectance of red, green and blue.
 Paint = tuple[float, float, float]
-"""Reflectance of red, green and blue."""
 
+# Faces are padded to this many corners by repeating the last one.
 MAX_CORNERS = 8
-"""Faces are padded to this many corners by repeating the last one."""
 
 
 def _table(name: str) -> list[dict[str, str]]:
@@ -44,8 +44,8 @@ def _table(name: str) -> list[dict[str, str]]:
 
 
 _MATERIALS = _table("materials.csv")
+# Material -> number. The sky comes first: index 0 is what is seen where nothing is drawn.
 INDEX = {row["name"]: number for number, row in enumerate(_MATERIALS)}
-"""Material -> number. The sky comes first: index 0 is what is seen where nothing is drawn."""
 
 
 def column(*fields: str) -> NDArray[np.float32]:
@@ -64,8 +64,8 @@ def paints(palette: str) -> list[Paint]:
     return [(float(row["red"]), float(row["green"]), float(row["blue"])) for row in rows]
 
 
+# (labels, materials) -> class id; 255 for materials that only labelled objects are made of.
 Table = NDArray[np.uint8]
-"""(labels, materials) -> class id; 255 for materials that only labelled objects are made of."""
 
 
 def class_table(classes: Sequence[str], by_label: Sequence[str], scenery: str) -> Table:
@@ -130,8 +130,8 @@ def shapes() -> dict[str, Shape]:
     return found
 
 
+# Drawing layers, first to last; within a layer far objects are drawn before near ones.
 GROUND, BACKDROP, STANDING = range(3)
-"""Drawing layers, first to last; within a layer far objects are drawn before near ones."""
 
 NO_SHADOW = -1.0
 
@@ -161,8 +161,8 @@ class Placed(NamedTuple):
     y: float = 0.0
 
 
+# Uniform numbers in [0, 1) of one object: kind, place, pose (0-7), colour (8-11), heat (12-13).
 Row = list[float]
-"""Uniform numbers in [0, 1) of one object: kind, place, pose (0-7), colour (8-11), heat (12-13)."""
 
 COLOUR, HEAT = 8, 12
 
@@ -173,8 +173,8 @@ def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
     return rows
 
 
+# Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels.
 KERB_M = (0.24, 0.17)
-"""Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels."""
 
 _STEPS = floats([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250])
 Numbers = float | NDArray[np.float64] | Floats
@@ -243,11 +243,11 @@ def draw_road(seed: int, index: int, factors: SceneFactors) -> Road:
     )
 
 
+# Quads on the ground in drawing order: corners (F, 8, 3), material (F,), label (F,).
 Quads = tuple[Floats, NDArray[np.intp], NDArray[np.intp]]
-"""Quads on the ground in drawing order: corners (F, 8, 3), material (F,), label (F,)."""
 
+# Corners (X, Z) of the ground around the road.
 TERRAIN = [(-2500.0, -2.0), (-2500.0, 2500.0), (2500.0, 2500.0), *[(2500.0, -2.0)] * 5]
-"""Corners (X, Z) of the ground around the road."""
 
 
 def ground_quads(road: Road) -> Quads:

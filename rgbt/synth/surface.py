@@ -20,11 +20,11 @@ from rgbt.synth.camera import NEAR_M, Floats, Key, SynthCamera, floats
 from rgbt.synth.light import Light
 from rgbt.synth.street import COLOURS, INDEX, MAX_CORNERS, Placed, Quads
 
+# Facets are drawn at this multiple of the image size, with so many binary digits.
 SCALE, _SHIFT = 2, 4
-"""Facets are drawn at this multiple of the image size, with so many binary digits."""
 
+# Facets with a smaller projected extent, in pixels, are left out.
 _SMALLEST = 0.8
-"""Facets with a smaller projected extent, in pixels, are left out."""
 
 _TILE, _LAST_SHADOW_M = 256, 45.0
 _FACADES = [INDEX["facade"], INDEX["facade_side"]]
@@ -51,7 +51,7 @@ class Facets:
 
 
 def sorted_for_drawing(placed: Sequence[Placed]) -> list[Placed]:
-    """By layer, and within a layer the farthest first (painter's algorithm)."""
+    """Sort by layer, and within a layer the farthest first (painter's algorithm)."""
     return sorted(placed, key=lambda thing: (thing.layer, -thing.z))
 
 

@@ -31,6 +31,7 @@ from rgbt.tracking.mlflow_upload import UploadState, is_sent, read_upload_state,
 from rgbt.tracking.mlflow_view import view_tags
 from rgbt.tracking.tracker import Link, Status, Tracking
 
+# Environment variables set before mlflow is imported, unless the user has set them.
 ENVIRONMENT = {
     "DO_NOT_TRACK": "true",
     "MLFLOW_LOGGING_LEVEL": "ERROR",
@@ -41,15 +42,14 @@ ENVIRONMENT = {
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
-"""Set before the first import of mlflow, unless the user set them."""
 
 SQLITE = "sqlite:///"
 EXPERIMENT = "rgbt"
+# Seconds until a call ends, one with files ends, and another process must free its lock.
 CALL_S, FILE_S, LOCK_WAIT_S = 30.0, 600.0, 50.0
-"""Seconds until a call ends, one with files ends, and another process must free its lock."""
 
+# Seconds that a training waits before it uses a failed store again; doubled each time.
 PAUSE_S = 300.0
-"""Seconds that a training waits before it uses a failed store again; doubled each time."""
 
 EXPERIMENT_NOTE = """\
 One run per configuration and seed. mIoU, Var, region/..., class/...: test split, percent (Var:
@@ -189,7 +189,7 @@ class MlflowTracking(Tracking):
         folder.describe(description)
 
     def after_step(self) -> None:
-        """After the first step, start or continue the MLflow run."""
+        """Start or continue the MLflow run after the first step."""
         if not self._is_connected:
             self.update()
 

@@ -36,18 +36,18 @@ from rgbt.tracking.tracker import Status
 if TYPE_CHECKING:
     from rgbt.tracking.mlflow_store import MlflowStore
 
+# Characters of a run's name (PostgreSQL refuses more), of a parameter and of a tag.
 NAME_LENGTH, PARAM_LENGTH, TAG_LENGTH = 250, 500, 5000
-"""Characters of a run's name (PostgreSQL refuses more), of a parameter and of a tag."""
 
+# Numbers in one call. MLflow takes 1000 metrics, parameters and tags together.
 BATCH_METRICS, BATCH_PARAMS = 800, 100
-"""In one call. MLflow takes 1000 of metrics, parameters and tags together."""
 
 FILES = (
     *("config.yaml", "provenance.json", "result.json", "*.patch", "counts_*.npz", "figures/*.png"),
     *("evaluations/*.npz", "evaluations/robustness/*/*.npz", "evaluations/robustness/*/*.json"),
 )
+# Files whose content is sent in another form.
 READ = ("run.json", "metrics.jsonl", "tables.json")
-"""Files whose content is sent in another form."""
 
 TABLE_FILE = "tables/iou.json"
 

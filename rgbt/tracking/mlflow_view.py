@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 RUNS_VIEW = "rgbt-runs"
+# Tag with "run" for runs, and "table" or "study" for the records of ``sweeps``.
 KIND_TAG = "kind"
-"""Tag with "run" for runs, and "table" or "study" for the records of ``sweeps``."""
 
 
 def view_tags() -> dict[str, str]:

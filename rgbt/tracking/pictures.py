@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 
+# Pixels without a label are grey: black is a class in most palettes.
 IGNORED_COLOUR = (128, 128, 128)
-"""Pixels without a label are grey: black is a class in most palettes."""
 
+# Width of a letter of eight points, on average.
 LETTER_INCHES = 0.07
-"""Width of a letter of eight points, on average."""
 
+# Percent points from the mean region to either end of the heat map's colours, at least.
 HALF_SPAN = 15.0
-"""Percent points from the mean region to either end of the heat map's colours, at least."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def draw_region_heat(heat: RegionHeat, path: Path) -> None:
 
 
 def _figure(width_inches: float, height_inches: float) -> Figure:
-    # Without pyplot: no global state, no display, nothing to close.
+    # Figures are made without pyplot: no global state, no display, nothing to close.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

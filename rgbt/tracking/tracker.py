@@ -8,8 +8,8 @@ from rgbt.runs.folder import Description, RunFolder
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 
+# (name, command or address), for the last lines of a run.
 Link = tuple[str, str]
-"""(name, command or address), for the last lines of a run."""
 
 
 class Tracking:

@@ -29,8 +29,8 @@ from rgbt.tracking.mlflow_view import view_path
 
 HOST = "127.0.0.1"
 NO_JOBS = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+# Longest times, in seconds, until the server answers, and until it has ended.
 START_S, STOP_S = 120.0, 10.0
-"""Seconds until the server must answer, and until it must have ended."""
 
 
 @dataclass(frozen=True)

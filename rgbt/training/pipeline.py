@@ -32,17 +32,17 @@ from rgbt.runtime.signals import WORDS, Stopped
 from rgbt.terminal import info, warn
 from rgbt.training.train import Training
 
-OF_GLOO = "gloo/transport"
-"""In the message of every error of a lost connection between CPUs."""
+# Part of every error message about a lost connection between CPUs.
+LOST_CONNECTION = "gloo/transport"
 
+# Time in which torchrun or srun ends a process because another one has failed, in seconds.
 GRACE_S = 5.0
-"""Time in which torchrun or srun ends a process because another one has failed, in seconds."""
 
+# Time that torchrun waits for the step in progress and its checkpoint, in seconds.
 SHUTDOWN_S = 300
-"""Time that torchrun waits for the step in progress and its checkpoint, in seconds."""
 
+# Interval between two checks of a run that another process trains.
 POLL_S = 1.0
-"""Interval between two checks of a run that another process trains."""
 
 
 def start(run: RunSpec, extra_tags: Mapping[str, str], words: Sequence[str]) -> int:
@@ -86,7 +86,7 @@ def _taking_part(group: Group | None, trainer: TrainerSettings) -> Iterator[None
         open_fabric(trainer)
         yield
     except Exception as error:
-        is_lost = isinstance(error, distributed.DistError) or OF_GLOO in str(error)
+        is_lost = isinstance(error, distributed.DistError) or LOST_CONNECTION in str(error)
         if group.rank == 0 and not is_lost:
             raise
         # The process that failed first reports it; this one is ended meanwhile, or failed alone.

@@ -106,7 +106,7 @@ def _of_steps(setup: TrainingSetup) -> str:
 
 
 def _write(*lines: str) -> None:
-    # Not as a message (`info`): drivers of sweeps take the last remark for what went wrong.
+    # This is no message (`info`): drivers of sweeps take the last remark for what went wrong.
     sys.stderr.write(without_controls("".join(f"{line}\n" for line in lines)))
 
 

@@ -347,7 +347,7 @@ class Training:
             return values
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
-        # As rows of the table: "thermal", "thermal, day", "source head, night".
+        # These become rows of the table: "thermal", "thermal, day", "source head, night".
         rows = {", ".join(n.replace("_", " ").split("/")[:-1]): v for n, v in beside.items()}
         classes = replace(tables.classes, subset_mious={**tables.classes.subset_mious, **rows})
         tables = replace(tables, classes=classes, consistency=pairs)

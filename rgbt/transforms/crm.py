@@ -16,11 +16,11 @@ from rgbt.requirements import Record
 from rgbt.transforms.maps import Maps, drawn_window, evaluated, short_edge_hw
 from rgbt.types import Example, Sample
 
+# (H, W, 3) RGB, or (H, W) of thermal; uint8 or float32, 0..255.
 Image = NDArray[Any]
-"""(H, W, 3) RGB, or (H, W) of thermal; uint8 or float32, 0..255."""
 
+# Every value of an 8-bit image.
 LEVELS = np.arange(256, dtype=np.uint8)
-"""Every value of an 8-bit image."""
 
 Factor = Annotated[float, Interval(ge=0, le=100)]
 
@@ -58,7 +58,7 @@ class CrmTransform:
 
     @property
     def dtype(self) -> type[np.uint8 | np.float32]:
-        """Of the images of its examples."""
+        """Type of the images of its examples."""
         return np.uint8 if self.colour == "intended" else np.float32
 
     @property

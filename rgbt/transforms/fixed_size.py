@@ -20,8 +20,8 @@ from rgbt.types import IGNORE, Example, Sample
 SizeFactor = Annotated[float, Interval(ge=0.01, le=16)]
 Angle = Annotated[float, Interval(ge=0, le=180)]
 OddPixels = Annotated[int, Interval(ge=1, le=255), Predicate(lambda side: side % 2), doc("odd")]
+# Shares of R, G, B in the luma of torchvision.
 LUMA = np.array([0.2989, 0.587, 0.114], np.float32)
-"""Shares of R, G, B in the luma of torchvision."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,11 +228,11 @@ class SemsegTransform(FixedSize):
         return maps.pad(full, fill).crop(window).example(False)
 
 
+# Grey level that the inputs of HeatNet normalise to 0.
 MIDDLE = np.float32(127.5)
-"""Grey level that the inputs of HeatNet normalise to 0."""
 
+# Label of pixels that a rotation brings in, as released.
 ROAD = 0
-"""Label of pixels that a rotation brings in, as released."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from rgbt.types import IGNORE, Example, Sample
 
 Indices = NDArray[np.int64]
+# Change of a map with its number: RGB (0), thermal (1), label (2), confidence (3).
 Change = Callable[[NDArray[Any], int], NDArray[Any]]
-"""Of a map and its number: RGB (0) and thermal (1) are images; label (2) and confidence (3)."""
 
+# Values of the pixels beyond a sample in these four maps.
 Fill = tuple[ArrayLike, ArrayLike, int, float]
-"""What pixels beyond a sample have in these four maps."""
 
+# Rows and columns of a part, each with its first pixel and its end.
 Window = tuple[slice, slice]
-"""Rows and columns of a part, each with its first pixel and its end."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,14 @@ class Maps:
             position[0], position[1] = self.rows[:, None], self.columns
         whole = self.each(lambda each, _: np.ascontiguousarray(each))
         return Example(
-            *(whole.rgb, whole.thermal, whole.label, self.centre_yx, position),
-            *(self.source_hw, self.name, whole.confidence),
+            rgb=whole.rgb,
+            thermal=whole.thermal,
+            label=whole.label,
+            confidence=whole.confidence,
+            centre_yx=self.centre_yx,
+            position=position,
+            original_hw=self.source_hw,
+            name=self.name,
         )
 
 

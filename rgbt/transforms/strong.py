@@ -20,7 +20,7 @@ Strength = Annotated[float, Interval(ge=0, le=0.5), doc("0.5 turns the hue by ha
 Sigma = Annotated[float, Interval(ge=0.01, le=50), doc("pixels")]
 
 CHANGES = ("brightness", "contrast", "saturation", "hue")
-OF_THERMAL = ("thermal_brightness", "thermal_contrast")
+THERMAL_SETTINGS = ("thermal_brightness", "thermal_contrast")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class StrongAugmentation:
 
         `generator` is of any device; the number of draws is always the same.
         """
-        device, names = generator.device, (*CHANGES, *OF_THERMAL)
+        device, names = generator.device, (*CHANGES, *THERMAL_SETTINGS)
 
         def draw(count: int) -> Tensor:
             drawn = torch.rand(count, len(names) + 1, generator=generator, device=device)

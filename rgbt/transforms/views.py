@@ -29,14 +29,14 @@ from rgbt.types import IGNORE, Batch
 
 Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]
 
+# Least share of the frame that the smallest rectangle of the drawn angles covers.
 LEAST = 0.1
-"""Share of the frame that the smallest rectangle of the drawn angles must hold."""
 
+# The three sets of the Temporal release: 393 triples each, one per image of MFNet's test list.
 PUBLISHED = Path(__file__).with_name("angles")
-"""The three sets of the Temporal release: 393 triples each, one per image of MFNet's test list."""
 
+# Digest of ``conf/consistency/views.yaml``, on which published TC and CA were measured.
 PUBLISHED_VIEWS = "e93922"
-"""Digest of ``conf/consistency/views.yaml``, on which published TC and CA were measured."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -180,7 +180,7 @@ class ViewSets:
 
     @cached_property
     def mark(self) -> str:
-        """For names of files: "" for the published views, six digits for other triples or views."""
+        """Part of file names: "" for the published views, six digits for other triples or views."""
         names = ("order", "mode", "rectangle", "resampling")
         settings = {name: getattr(self.view, name) for name in names}
         settings |= {"camera": asdict(self.view.camera), "outside": self.view.outside_label}

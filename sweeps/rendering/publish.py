@@ -1,30 +1,39 @@
-"""Prints a computed table and writes its files."""
+"""Prints a table, its preview (``dry_run=true``) and what is missing, and writes its files."""
 
 from __future__ import annotations
 
+import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from rich.console import Group
+from rich.text import Text
 
 from rgbt.files.atomic import write_atomic
-from rgbt.tables import TextTable
+from rgbt.tables import ABSENT, TextTable
 from rgbt.terminal import info, path_lines, print_rich, rich_table
-from sweeps.point import Outcome
-from sweeps.rendering.claims import claim_grids, claims_csv, claims_frame, claims_markdown, counted
-from sweeps.rendering.effects import effects_csv, effects_figure, effects_grids
+from sweeps.point import Outcome, State
+from sweeps.rendering.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
+from sweeps.rendering.effects import effects_figure, effects_grids
 from sweeps.rendering.figure import figure_of, write_figure
 from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 from sweeps.table.cells import NO_VALUE
-from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.stored import TableResult
-from sweeps.worker.point_list import other_code_line
+from sweeps.worker.point_list import estimated_seconds, other_code_line
+from sweeps.worker.progress import duration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from sweeps.table_plan import TablePlan
+
+STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
+TRAINED = "trained, not evaluated for all columns"
 
 
 def publish_table(
@@ -47,10 +56,10 @@ def publish_table(
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
     runs: dict[CellRunId, Outcome] = {**request.runs(outcomes), **external}
-    result = TableResult.of(request, runs, judge, efficiency_cells(request))
+    result = TableResult(request, runs, judge)
     shown = grid_of(result, TERMINAL)
     claims = claims_frame(result.claims)
-    grids = [shown, *grids_of(result), *claim_grids(claims, narrow=True)]
+    grids = [shown, *grids_of(result), *claim_grids(claims, noted=True)]
     print_rich(Group(*map(rich_table, grids)))
     failed = _report_missing(result, outcomes)
     if len(claims):
@@ -60,9 +69,9 @@ def publish_table(
         "table.csv": tidy_csv(result.scored),
         "table.tex": latex(shown),
     }
-    texts |= {"claims.csv": claims_csv(claims)} if len(claims) else {}
+    texts |= {"claims.csv": frame_csv(claims)} if len(claims) else {}
     if result.effects is not None:
-        texts["effects.csv"] = effects_csv(result.effects.lines)
+        texts["effects.csv"] = frame_csv(result.effects.frame)
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
@@ -87,17 +96,14 @@ def grid_of(result: TableResult, style: Style) -> TextTable:
 
 
 def grids_of(result: TableResult) -> list[TextTable]:
-    """Differences of the forms, and effects of the design, as far as there are any."""
+    """Effects of the design, if the table has one."""
     design = result.request.table.design
-    forms = [] if result.forms is None else [result.forms]
-    effects = result.effects if design is not None else None
-    return forms if effects is None or design is None else [*forms, *effects_grids(effects, design)]
+    return [] if result.effects is None or design is None else effects_grids(result.effects, design)
 
 
 def markdown_of(result: TableResult) -> str:
-    """The table, the forms, the effects and the claims in Markdown."""
-    grids = [grid_of(result, MARKDOWN), *grids_of(result)]
-    parts = [grid.to_markdown() for grid in grids]
+    """The table, the effects and the claims in Markdown."""
+    parts = [grid.to_markdown() for grid in (grid_of(result, MARKDOWN), *grids_of(result))]
     parts += [claims_markdown(claims_frame(result.claims))] if result.claims else []
     return "\n".join(parts)
 
@@ -130,3 +136,56 @@ def _report_missing(result: TableResult, outcomes: Sequence[Outcome]) -> bool:
     if other:
         info(other)
     return bool(failed) or empty
+
+
+def print_preview(plan: TablePlan, outcomes: Sequence[Outcome], workers: int) -> None:
+    """Print the runs of a table with their states, and what is left to do."""
+    request = plan.request
+    if outcomes:
+        cells = tuple(
+            (
+                *(outcome.point.label, outcome.state),
+                ABSENT if outcome.seconds is None else f"{outcome.seconds:.0f}",
+                " ".join(outcome.keys) or ABSENT,
+                outcome.reason or (TRAINED if outcome.is_trained else ""),
+            )
+            for outcome in outcomes
+        )
+        title = f"{request.name}, scale={request.scale}: runs of the cells"
+        header = ("cell", "state", "seconds", "run", "reason")
+        print_rich(rich_table(TextTable(title, header, cells)))
+    lines = _summary(request, outcomes, workers)
+    if plan.until_decided is not None:
+        further = len(plan.until_decided.most_runs()) - len(outcomes)
+        seconds = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
+        time = f", {duration(further * median(seconds) / workers)}" if seconds else ""
+        lines.append(
+            f"Until all claims are decided: at most {further} runs more than these{time}; rows of "
+            "decided claims get no more."
+        )
+    print_rich(Text("\n".join(lines)))
+
+
+def _summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:
+    """Sentences below the runs: numbers, time left, further evaluations, what needs no run."""
+    states = Counter(outcome.state for outcome in outcomes)
+    counted = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
+    lines = [f"{len(outcomes)} runs: {counted or 'none'}."]
+    if len(outcomes) > states["finished"]:
+        seconds = estimated_seconds(outcomes, workers)
+        known = duration(seconds) if seconds is not None else "known when one run is finished"
+        lines.append(f"Time left with workers={workers}: {known}.")
+    lines += [line for line in (other_code_line(outcomes),) if line]
+    evaluations = request.evaluations() if outcomes else ()
+    words = (shlex.join(each.command) for each in evaluations if not each.world)
+    commands = list(dict.fromkeys(each.replace("rgbt.", "rgbt ", 1) for each in words))
+    worlds = list(dict.fromkeys(each.world for each in evaluations if each.world))
+    if worlds:
+        commands.append(f"rgbt evaluate in {len(worlds)} worlds ({', '.join(worlds)})")
+    trained = sum(outcome.is_trained for outcome in outcomes)
+    if commands:
+        shown = "; ".join(commands)
+        lines.append(f"Evaluations of every run that still lacks them: {shown}.")
+    if commands and trained:
+        lines.append(f"Already trained: {trained}; the time left excludes their evaluations.")
+    return lines

@@ -20,10 +20,7 @@ from sweeps.table.cells import (
     published,
 )
 from sweeps.table.efficiency import SCALE
-from sweeps.table.table import MEASURED, Column, Form, Row
-
-MAX_ON_ONE_LINE = 3
-"""Most columns with ours, published and difference on one line; more columns use several lines."""
+from sweeps.table.table import Column, Form, Row
 
 DOUBTFUL = "The printed value does not agree with the others of its row."
 NOT_PRINTED = "Not in the paper."
@@ -38,15 +35,7 @@ FORMS: dict[Form, str] = {
     "released": "Form: no row of this table has a released form that differs from the text.",
 }
 """Of tables that say nothing about their forms."""
-COUNTED = (
-    f"Parameters and operations are those of the networks at scale={SCALE}, without any run and "
-    "without discriminators."
-)
-MEASURED_ON = (
-    f"Memory and speed are those of the networks at scale={SCALE} with random weights, measured on "
-    "{device}, batch 1. In brackets: the ratio to the first row. Compare the ratios with the "
-    "paper, not the values."
-)
+COUNTED = f"Parameters are those of the networks at scale={SCALE}, without discriminators."
 CSV_HEADER = (
     *("table", "row", "column", "mean", "sd", "n", "published", "difference", "reason", "runs"),
 )
@@ -102,22 +91,15 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     table, seeds = scored.table, scored.seeds
     printed = any(row.values for row in table.rows)
     remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
+    remarks += _lists(scored) if printed or scored.lists else []
     if seeds:
         listed, many = ", ".join(map(str, seeds)), len(seeds) > 1
         over = "mean ± standard deviation (n - 1) over seeds" if many else "of seed"
         remarks.append(f"Ours: scale={scored.scale}, {over} {listed}.")
     if scored.cells and printed:
         remarks.append(table.forms.get(scored.form, FORMS[scored.form]))
-    shown = [
-        (column, scored.cells[row.label, column.name])
-        for row in table.rows
-        for column in table.columns
-        if column.efficiency is not None and (row.label, column.name) in scored.cells
-    ]
-    if any(column.efficiency not in MEASURED for column, _ in shown):
-        remarks.append(COUNTED)
-    devices = dict.fromkeys(cell.device for _, cell in shown if cell.device)
-    remarks += [MEASURED_ON.format(device=device) for device in devices]
+    sizes = {column.name for column in table.columns if column.efficiency is not None}
+    remarks += [COUNTED] if sizes & {name for _, name in scored.cells} else []
     if seeds and scored.scale != "paper" and printed:
         remarks.append(SMALL.format(scale=scored.scale))
     if extra:
@@ -129,6 +111,21 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     return remarks
 
 
+def _lists(scored: ScoredTable) -> list[str]:
+    """Which lists the rows were trained and selected on; whether rows of ours differ in them."""
+    own = {row.label: row.lists for row in scored.table.rows if row.lists and row.values}
+    printed = [f"Lists of published rows: {scored.table.lists}."] if scored.table.lists else []
+    if own:
+        printed.append(f"{'; '.join(f'{label}: {text}' for label, text in own.items())}.")
+    groups: dict[str, list[str]] = {}
+    for label, text in scored.lists.items():
+        groups.setdefault(text, []).append(label)
+    if len(groups) < 2:
+        return [*printed, *(f"Lists of our rows: {text}." for text in groups)]
+    shown = "; ".join(f"{text} ({', '.join(labels)})" for text, labels in groups.items())
+    return [*printed, f"Our rows have different lists: {shown}."]
+
+
 @dataclass
 class _Lines:
     """Makes the lines of a table; `sentences` are its footnotes in the order of their first use."""
@@ -138,11 +135,8 @@ class _Lines:
     sentences: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        table = self.scored.table
-        self.columns = table.columns
-        self.on_one_line = len(self.columns) <= MAX_ON_ONE_LINE
         # Published values have as many decimals as the paper prints.
-        printed = [value for row in table.rows for value in row.values.values()]
+        printed = [value for row in self.scored.table.rows for value in row.values.values()]
         digits = [repr(value).partition(".")[2] for value in printed if value is not None]
         self.decimals = max((len(each.rstrip("0")) for each in digits), default=2)
 
@@ -153,27 +147,18 @@ class _Lines:
         return text + "".join(f"[{self.sentences.index(each) + 1}]" for each in given)
 
     def header(self) -> tuple[str, ...]:
-        """The names of the columns, behind the label and the number of seeds."""
-        names = ["", "seeds"] if self.on_one_line else ["", "", "seeds"]
-        for column in self.columns:
-            names.append(self.noted(column.name, None if column.printed else NOT_PRINTED))
-            names += ["published", "difference"] * (self.on_one_line and column.printed)
-        return tuple(names)
+        """The names of the columns, behind the label, the kind of line and the number of seeds."""
+        columns = self.scored.table.columns
+        own = (self.noted(each.name, "" if each.printed else NOT_PRINTED) for each in columns)
+        return ("", "", "seeds", *own)
 
     def row(self, row: Row) -> list[tuple[str, ...]]:
-        """The lines of one row: a single one for few columns."""
+        """The lines of one row: ours, published, difference, as far as there are any."""
         label = self.noted(row.label, self._same_runs(row), *(() if row.doubtful else row.remarks))
-        if self.on_one_line:
-            line = [label, self._seeds(row)]
-            for column in self.columns:
-                line.append(self._ours(row, column))
-                if column.printed:
-                    line += [self._published(row, column), self._difference(row, column)]
-            return [tuple(line)]
-        cells = self.scored.cells
-        is_run = any((row.label, column.name) in cells for column in self.columns)
-        is_printed = any(published(row, column) is not None for column in self.columns)
-        both = any(not math.isnan(self.scored.difference(row, column)) for column in self.columns)
+        columns, cells = self.scored.table.columns, self.scored.cells
+        is_run = any((row.label, column.name) in cells for column in columns)
+        is_printed = any(published(row, column) is not None for column in columns)
+        both = any(not math.isnan(self.scored.difference(row, column)) for column in columns)
         kinds = (
             ("ours", self._ours, is_run),
             ("published", self._published, is_printed or not is_run),
@@ -183,14 +168,14 @@ class _Lines:
         for kind, text, is_shown in kinds:
             if is_shown:
                 seeds = self._seeds(row) if kind == "ours" else ""
-                texts = (text(row, column) for column in self.columns)
+                texts = (text(row, column) for column in columns)
                 lines.append(("" if lines else label, kind, seeds, *texts))
         return lines
 
     def _same_runs(self, row: Row) -> str | None:
         """A note on an equal row: at scale=demo networks of all sizes are one."""
         keys, rows = self._keys(row), self.scored.table.rows
-        counted = list(filter(is_counted, self.columns))
+        counted = list(filter(is_counted, self.scored.table.columns))
         metrics = [metric_of(column, row) for column in counted]
         for other in rows[: rows.index(row)]:
             is_same = metrics == [metric_of(column, other) for column in counted]
@@ -199,12 +184,13 @@ class _Lines:
         return None
 
     def _keys(self, row: Row) -> tuple[str, ...]:
-        cells = (self.scored.cells.get((row.label, column.name)) for column in self.columns)
+        columns = self.scored.table.columns
+        cells = (self.scored.cells.get((row.label, column.name)) for column in columns)
         return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
 
     def _seeds(self, row: Row) -> str:
         """How many seeds the row's values are means of."""
-        columns = filter(is_of_runs, self.columns)
+        columns = filter(is_of_runs, self.scored.table.columns)
         cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
         there = [cell.seeds for cell in cells if cell is not None]
         counts = sorted({seeds for seeds in there if seeds} or set(there))
@@ -215,7 +201,7 @@ class _Lines:
         cell = self.scored.cells.get(cell_id)
         if cell is None:
             return ABSENT
-        text = f"{cell.mean:.2f}{_bracketed_ratio(cell.ratio)}"
+        text = f"{cell.mean:.2f}"
         if math.isnan(cell.mean):
             text = ABSENT if cell.mark == NO_VALUE else cell.mark
         text += "" if math.isnan(cell.sd) else f" ± {cell.sd:.2f}"
@@ -226,21 +212,12 @@ class _Lines:
         printed = published(row, column)
         if printed is None:
             return ABSENT
-        ratio, table = math.nan, self.scored.table
-        if column.efficiency in MEASURED:  # to the first row that we measured
-            cells = ((r, self.scored.cells.get((r.label, column.name))) for r in table.rows)
-            rows = [r for r, cell in cells if cell is not None and not math.isnan(cell.ratio)]
-            ratio = printed / (published(rows[0], column) or math.nan) if rows else math.nan
         doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
-        return self.noted(f"{printed:.{self.decimals}f}{_bracketed_ratio(ratio)}", *doubts)
+        return self.noted(f"{printed:.{self.decimals}f}", *doubts)
 
     def _difference(self, row: Row, column: Column) -> str:
         value = self.scored.difference(row, column)
         return ABSENT if math.isnan(value) else f"{value:+.2f}"
-
-
-def _bracketed_ratio(ratio: float) -> str:
-    return "" if math.isnan(ratio) else f" ({ratio:.2f}x)"
 
 
 def tidy_csv(scored: ScoredTable) -> str:

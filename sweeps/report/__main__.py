@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from analysis.arguments import Resamples, check_out
+from analysis.commands import Resamples, check_out
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
@@ -88,12 +88,15 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -
     from rgbt.config.options import readable_paths
     from sweeps.report import pages
     from sweeps.table.load_table import OWN
-    from sweeps.verdicts.stored import FinishedRuns, TableResults
+    from sweeps.verdicts.stored import FinishedRuns, TableResults, known_tables
     from sweeps.worker.planner import Planner
 
     runs = finished_runs(runs_dir, archive)
     planner = Planner(readable_paths([f"runs_dir={runs_dir}"]))
-    source = TableResults(FinishedRuns(runs), planner, OWN, resamples, counted=counted)
+    remarks: list[str] = []
+    tables = known_tables(OWN, remarks)
+    finished = FinishedRuns(runs)
+    source = TableResults(finished, planner, tables, resamples, counted=counted, remarks=remarks)
     notes = {path.parent.name: path for path in sorted(runs_dir.glob("studies/*/study.md"))}
     studies = {name: path.read_text(errors="replace") for name, path in notes.items()}
     console = Console(stderr=True)

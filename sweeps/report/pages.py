@@ -7,6 +7,8 @@ import hashlib
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +55,6 @@ MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL
 """Numbers in a page written by hand, between two comments."""
 
 FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
-OF_RUN = ["method", "images", "scale", "dataset"]
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 """What a record that somebody has edited may raise."""
@@ -82,9 +83,8 @@ class TableView:
         self.frame = claims_frame(result.claims, ", ".join(filter(None, (form, words))))
         self.counted = counted(self.frame)
         self.claims = "\n".join(claim_lines(self.frame))
-        grid = grid_of(result, MARKDOWN)
-        self.grid = markdown(TextTable("", grid.header, grid.rows, grid.notes))
-        self.grids = list(map(markdown, grids_of(result)))
+        grids = [replace(grid_of(result, MARKDOWN), title=""), *grids_of(result)]
+        self.grids = list(map(markdown, grids)) if self.is_run else []
         self.drawn = drawn_of(result) if self.is_run else None
         file = f"{request.name.replace('/', '-')}_{request.variant}.svg"
         self.figure = file if self.drawn is not None else ""
@@ -105,7 +105,9 @@ class PaperView:
         is_run = frame["verdict"] != "not run"
         self.counted = counted(frame)
         self.judged = list(map(markdown, claim_grids(frame[is_run])))
-        self.not_run = "\n".join(claim_lines(frame[~is_run]))
+        tables = frame["table"].str.rpartition("/")[2]
+        lines = "- " + tables + ", `" + frame["claim"] + "`: " + frame["says"]
+        self.not_run = "\n".join(lines[~is_run])
 
 
 def markdown(grid: TextTable) -> str:
@@ -176,39 +178,36 @@ class Report:
             except ODD as error:
                 self.remarks.append(f"Run {run.key} is left out: {one_line(error)}.")
         if not rows:
-            return {"runs": "", "origin": "", "bases": []}
-        frame, lines = pd.DataFrame(rows), []
-        metrics = [name for name in frame if name not in (*OF_RUN, "seed", "time", "tables")]
-        for key, each in frame.groupby(OF_RUN):
-            cells = [
-                f"{number(each[name].mean())}{f' ± {number(each[name].std())}' * (len(each) > 1)}"
-                for name in metrics
-            ]
-            seeds = ", ".join(map(str, sorted(each["seed"])))
-            tables = "; ".join(dict.fromkeys("; ".join(each["tables"]).split("; ")))
-            lines.append((*key[:3], seeds, *cells, duration(each["time"].median()), tables))
-        header = (*OF_RUN[:3], "seeds", *metrics, "time", "rows of")
+            return {"runs": [], "origin": ""}
+        frame, grids = pd.DataFrame(rows), []
+        metrics = (names.MIOU, names.VAR)
+        for (images, scale), kind in frame.groupby(["images", "scale"]):
+            lines = []
+            for (method, _), each in kind.groupby(["method", "dataset"]):
+                many = len(each) > 1
+                scores = [
+                    f"{number(each[name].mean())}{f' ± {number(each[name].std())}' * many}"
+                    for name in metrics
+                ]
+                seeds = ", ".join(map(str, sorted(each["seed"])))
+                tables = "; ".join(dict.fromkeys("; ".join(each["tables"]).split("; ")))
+                lines.append((method, seeds, *scores, duration(each["time"].median()), tables))
+            header = ("method", "seeds", *metrics, "time", "rows of")
+            title = f"{len(kind)} runs on {images} images, scale={scale}"
+            grids.append(markdown(TextTable(title, header, tuple(lines))))
         known = pd.DataFrame(facts)
         texts = {name: sorted(set(known[name].dropna()) - {""}) for name in known}
         origin = tuple((name, ", ".join(each) or ABSENT) for name, each in texts.items())
-        counts = frame.groupby(OF_RUN[1:3]).size()
-        return {
-            "runs": markdown(TextTable("", header, tuple(lines))),
-            "origin": markdown(TextTable("", ("what", "value"), origin)),
-            "bases": [f"{n} on {images} images, scale={s}" for (images, s), n in counts.items()],
-        }
+        return {"runs": grids, "origin": markdown(TextTable("", ("what", "value"), origin))}
 
     def _scores(self, run: RunResult) -> dict[str, Any]:
-        """Of a run: the keys `OF_RUN`, seed, scores, time and tables."""
+        """Of a run: what it is, its seed, scores, time and tables."""
         tags, stored = run.tags, self.source.stored
         counts, basis = stored.counts(run, OWN_COUNTS), stored.basis([run])
-        group = (tags.get(GROUP, run.key), basis.images, basis.scale, counts.dataset)
-        regions = [names.region(place + 1) for place in range(counts.counts.shape[1])]
-        metrics = (names.MIOU, names.VAR, *regions)
         return {
-            **dict(zip(OF_RUN, group, strict=True)),
-            "seed": int(tags["rgbt.seed"]),
-            **{name: value(name, counts, counts.absent) for name in metrics},
+            **{"method": tags.get(GROUP, run.key), "dataset": counts.dataset},
+            **{"images": basis.images, "scale": basis.scale, "seed": int(tags["rgbt.seed"])},
+            **{name: value(name, counts, counts.absent) for name in (names.MIOU, names.VAR)},
             "time": float(run.result["seconds_of_last_process"]),
             "tables": "; ".join(sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG))),
         }
@@ -247,7 +246,7 @@ class Report:
         data = {
             **self.data,
             "num_runs": len(self.runs),
-            "at_paper_scale": any("scale=paper" in each for each in self.data["bases"]),
+            "at_paper_scale": any("scale=paper" in each for each in self.data["runs"]),
             "remarks": self.remarks,
             "counts": markdown(counts_grid(self.claims)),
             "papers": self.papers,
@@ -290,6 +289,10 @@ class Report:
 
     def images(self) -> dict[str, bytes]:
         """The figures of the pages that were made, as SVG by the names of their files."""
+        return self._images
+
+    @cached_property
+    def _images(self) -> dict[str, bytes]:  # a second drawing has another layout
         import tempfile
 
         from sweeps.rendering.figure import write_figure
@@ -346,7 +349,7 @@ def _networks(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     sizes, weights, tests = [], [], []
     for each in networks:
         for model in each["models"]:
-            words = [*each.get("overrides", ()), *f"model={model}".split()]
+            words = (*each.get("overrides", ()), *f"model={model}".split())
             sizes.append((each["name"], f"`model={model}`", f"{million_parameters(words):.2f}"))
         weights += [(each["name"], file, f"<{address}>") for file, address in each["weights"]]
         tests.append((each["name"], ", ".join(f"`{test}`" for test in each["tests"])))

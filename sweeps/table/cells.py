@@ -10,15 +10,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import details_of_metric, value
 from rgbt.runs.result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
-from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
+from sweeps.table.table import Column, Form, Row, Table
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
 NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
 OWN_COUNTS = "counts_test.npz"
 """Path, in the run folder, of the counts of the evaluation that every run makes itself."""
@@ -37,10 +35,9 @@ class TableCell:
     Attributes:
         mean: over seeds, percent (Var: squared percent points); NaN without any.
         sd: standard deviation over seeds with n - 1; NaN for fewer than two.
-        seeds: number of seeds of the mean; 0 for the efficiency of a network, which needs no run.
+        seeds: number of seeds of the mean; 0 for the size of a network, which needs no run.
         reason: why seeds are missing, or ""; `mark` says it in a word, e.g. "failed".
         keys: of the runs.
-        ratio: to the first row, of memory and speed, which were measured on `device`.
     """
 
     mean: float
@@ -49,8 +46,6 @@ class TableCell:
     reason: str = ""
     mark: str = ""
     keys: tuple[str, ...] = ()
-    ratio: float = math.nan
-    device: str = ""
 
 
 def metric_of(column: Column, row: Row) -> str:
@@ -81,12 +76,6 @@ def counts_path(column: Column, table: Table) -> str:
     """Path of the column's counts, relative to the run folder."""
     evaluation = evaluation_of(column, table)
     return OWN_COUNTS if evaluation is None else evaluation.path
-
-
-def headline_columns(columns: Sequence[Column]) -> list[Column]:
-    """Those of `HEADLINES`, over all images or those of the day or the night."""
-    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
-    return [each for each in columns if each.metric in {p + h for p in parts for h in HEADLINES}]
 
 
 def is_counted(column: Column) -> bool:
@@ -186,8 +175,9 @@ class ScoredTable:
     """A table with our values.
 
     Attributes:
-        cells: only of rows that were run, and of columns of efficiency.
+        cells: only of rows that were run, and of sizes of networks.
         commits: git commit -> number of runs made by it.
+        lists: label of a row that was run -> the lists of its runs, in words.
         marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
             `sweeps.verdicts.judge.TableJudge.marks`.
     """
@@ -199,12 +189,11 @@ class ScoredTable:
     cells: Mapping[CellId, TableCell]
     commits: Mapping[str, int]
     form: Form = "paper"
+    lists: Mapping[str, str] = field(default_factory=dict)
     marks: Mapping[CellId, int] = field(default_factory=dict)
 
     def difference(self, row: Row, column: Column) -> float:
-        """Ours less the printed value; NaN where one is missing or of another device."""
-        if column.efficiency in MEASURED:
-            return math.nan
+        """Ours less the printed value; NaN where one is missing."""
         cell = self.cells.get((row.label, column.name))
         printed = published(row, column)
         return math.nan if cell is None or printed is None else cell.mean - printed
@@ -225,12 +214,15 @@ def score(
     sizes: Mapping[CellId, TableCell] | None = None,
     reader: Reader = lambda run, path: run.counts(path),
 ) -> ScoredTable:
-    """Compute every cell of the rows with `runs`; `sizes` are those of efficiency."""
+    """Compute every cell of the rows with `runs`; `sizes` are those of networks."""
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
     cells: dict[CellId, TableCell] = {}
     for row in table.rows:
         outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
         cells |= row_cells(table, row, outcomes, reader)
+    lists: dict[str, list[str]] = {}
+    for (label, _), outcome in runs.items():
+        lists.setdefault(label, []).extend(run.lists for run in outcome.results if run.lists)
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
@@ -239,6 +231,7 @@ def score(
         seeds=tuple(seed for seed in seeds if seed >= 0),
         cells=cells | dict(sizes or {}),
         commits=Counter(commit for commit in made_by.values() if commit is not None),
+        lists={label: " or ".join(sorted(set(each))) for label, each in lists.items() if each},
     )
 
 
@@ -249,7 +242,7 @@ def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, 
     """
     marks: dict[CellId, int] = {}
     for column in table.columns:
-        if column.efficiency not in COUNTED or column.best == "none":
+        if column.efficiency is None or column.best == "none":
             continue
         values = {
             cell_id: round(cell.mean, 2)

@@ -89,8 +89,22 @@ class Design(Strict):
         """Letters of the factors."""
         return tuple(factor.letter for factor in self.factors)
 
-    def cells(self, part: Part) -> tuple[Levels, ...]:
+    @property
+    def parts(self) -> dict[str, Part]:
+        """The experiments that it is, by the name of the group of their rows."""
+        parts = {TESTED: self.tested, TRAINED: self.trained}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def places(self, name: str, method: str) -> list[tuple[str, str]]:
+        """Label of the row, and name of the world its network is tested in, of every cell."""
+        cells = map(cell_name, self.cells(name))
+        return [
+            (f"{method} natural", c) if name == TESTED else (f"{method} {c}", "") for c in cells
+        ]
+
+    def cells(self, name: str) -> tuple[Levels, ...]:
         """Levels of every cell of a part; the first factor changes most slowly."""
+        part = self.parts[name]
         free = [letter for letter in self.letters if letter not in part.generators]
         words: tuple[Level, ...] = ("low", "high")
         cells = []
@@ -107,7 +121,7 @@ class Design(Strict):
         combined = (each.overrides for each in self.combined if each.levels.items() <= cell.items())
         return tuple(chain(*of_factors, *combined))
 
-    def effects(self, part: Part) -> dict[str, dict[Effect, int]]:
+    def effects(self, part: str) -> dict[str, dict[Effect, int]]:
         """Shown name -> main effects and interactions of two factors with that contrast, and signs.
 
         In a fraction several effects have the same contrast over the cells ("aliases"): their sum
@@ -135,25 +149,19 @@ class Design(Strict):
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """The attributes of its rows: of each method and trained cell, then of each method."""
-        part = self.trained or Part()
-        for method, cell in product(self.methods, self.cells(part) if self.trained else ()):
-            words = (*self.overrides, *part.overrides, *self.cell_overrides(cell))
-            words = (*words, *method.overrides)
-            yield {
-                **{"label": trained_label(method.name, cell), "group": TRAINED},
-                **{"experiment": method.experiment, "overrides": words},
-                "settings": {"method": method.name, **cell},
-            }
-        part = self.tested or Part()
-        cells = self.cells(part) if self.tested else ()
-        worlds = {cell_name(each): (*part.overrides, *self.cell_overrides(each)) for each in cells}
-        for method in self.methods if self.tested else ():
-            words = (*self.overrides, *method.overrides)
-            yield {
-                **{"label": tested_label(method.name), "group": TESTED, "tested_in": worlds},
-                **{"experiment": method.experiment, "overrides": words},
-                "settings": {"method": method.name},
-            }
+        for name, method in product((TRAINED, TESTED), self.methods):
+            if (part := self.parts.get(name)) is None:
+                continue
+            cells = {cell_name(each): self.cell_overrides(each) for each in self.cells(name)}
+            worlds = {cell: (*part.overrides, *words) for cell, words in cells.items()}
+            own = worlds if name == TRAINED else {"natural": ()}
+            for cell, words in own.items():
+                yield {
+                    **{"label": f"{method.name} {cell}", "group": name},
+                    **{"experiment": method.experiment, "settings": {"method": method.name}},
+                    "overrides": (*self.overrides, *words, *method.overrides),
+                    "tested_in": worlds if name == TESTED else {},
+                }
 
     @model_validator(mode="after")
     def _check_names(self) -> Design:
@@ -172,17 +180,16 @@ class Design(Strict):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Design:
-        parts = [part for part in (self.trained, self.tested) if part is not None]
-        if not parts:
+        if not self.parts:
             raise ValueError("expected trained, tested or both, got none.")
-        for part in parts:
+        for name, part in self.parts.items():
             free = [letter for letter in self.letters if letter not in part.generators]
             for letter, others in part.generators.items():
                 check_choice("generators", letter, self.letters)
                 for other in others:
                     check_choice("generators (factors without a generator)", other, free)
-            cells = self.cells(part)
-            for main, *aliases in map(list, self.effects(part).values()):
+            cells = self.cells(name)
+            for main, *aliases in map(list, self.effects(name).values()):
                 is_constant = len({sign_of(cell, main) for cell in cells}) == 1
                 if (len(main) == 1 and aliases) or is_constant:
                     raise ValueError(
@@ -204,13 +211,3 @@ def sign_of(cell: Levels, effect: Effect) -> int:
 def cell_name(cell: Levels) -> str:
     """The cell as it is shown: "O-N+"."""
     return "".join(f"{letter}{'+' if level == 'high' else '-'}" for letter, level in cell.items())
-
-
-def trained_label(method: str, cell: Levels) -> str:
-    """Label of the row of a method that is trained in a cell."""
-    return f"{method} {cell_name(cell)}"
-
-
-def tested_label(method: str) -> str:
-    """Label of the row of a method that is trained without any factor."""
-    return f"{method} natural"

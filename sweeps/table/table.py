@@ -8,26 +8,23 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import model_validator
+from pydantic import BeforeValidator, model_validator
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import available, chosen_scale
-from rgbt.config.values import check_value
-from rgbt.metrics.named import OF_PAIRS, parse
+from rgbt.metrics import names
+from rgbt.metrics.named import PAIR_SCORES, parse
 from rgbt.metrics.pairs import Protocol
-from rgbt.ranges import Size
 from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
 Form = Literal["paper", "released"]  # what a row is run as
 
-Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
-"""Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
+RELEASED = ", released"
+"""Ending of the label of a row in its released form, beside the row of the paper's form."""
 
-COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")  # the same on every machine
-MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
-"""Of one device, shown with the ratio to the first row."""
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +38,8 @@ class Column(Strict):
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: of two or more other columns of the row, e.g. of day and night.
-        efficiency: of the row's network at scale=paper (`sweeps.table.efficiency`), without any
-            run; on images of the size `settings.image_hw` of the row, or 480 x 640.
+        efficiency: of the row's network, without any run: millions of "parameters" at scale=paper
+            (`sweeps.table.efficiency`), or the "speed" that the paper prints, which is shown alone.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: its protocol, see `rgbt.metrics.pairs`.
         head: of a network with a head per domain, the one that predicts.
@@ -58,7 +55,7 @@ class Column(Strict):
     metric: str | None = None
     minus: tuple[str, str] | None = None
     mean: Annotated[tuple[str, ...], MinLen(2)] | None = None
-    efficiency: Efficiency | None = None
+    efficiency: Literal["parameters", "speed"] | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
     head: Head = "as trained"
@@ -80,22 +77,16 @@ class Column(Strict):
         given = [key for key in kinds if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(f"expected one of {', '.join(kinds)}, got {given}.")
-        of_pairs = (self.metric or "").rpartition("/")[2] in OF_PAIRS
+        of_pairs = (self.metric or "").rpartition("/")[2] in PAIR_SCORES
         if of_pairs != (self.frames is not None):
-            raise ValueError(f"'frames' is needed for {', '.join(OF_PAIRS)}, and only for these.")
+            raise ValueError(
+                f"'frames' is needed for {', '.join(PAIR_SCORES)}, and only for these."
+            )
         if of_pairs or self.metric is None:  # these would have no effect
             for key in ("modality", "head", "corruption", "batch_norm"):
                 if getattr(self, key) not in (None, "as trained", "default"):
                     raise ValueError(f"'{key}' is only for scores of single frames.")
         return self
-
-
-@dataclass(frozen=True, kw_only=True)
-class Factor(Strict):
-    """The x axis of the figure: its label, and "log" for values > 0."""
-
-    name: str
-    axis: Literal["linear", "log"] = "linear"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +119,11 @@ class Row(Strict):
         same_as: label of an earlier row that may be the same run.
         network: overrides that describe the row's network for an evaluation with a file of weights;
             (): those of `experiment`, if there is one.
-        x: where the row lies on the axis of `Table.factor`.
         without: columns that the row's network has no score for; columns computed from them are
             left out too.
         tested_in: name -> overrides of the data set with which the row's network is tested too.
         values: printed values by column; None where the paper prints a dash.
+        lists: those of the published row, where they are not those of the table.
         doubtful: columns whose printed value carries the row's remarks as a footnote.
         remarks: one sentence each.
     """
@@ -148,10 +139,10 @@ class Row(Strict):
     released: ReleasedForm | None = None
     same_as: str | None = None
     network: tuple[str, ...] = ()
-    x: float | None = None
     without: tuple[str, ...] = ()
     tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
+    lists: str = ""
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
@@ -163,8 +154,6 @@ class Row(Strict):
         for experiment in (self.experiment, released):
             if experiment is not None:
                 check_choice("experiment", experiment, available("experiment"))
-        if size := self.settings.get("image_hw"):
-            check_value("settings.image_hw", size, Size)
         return self
 
 
@@ -175,26 +164,27 @@ class Table(Strict):
     Attributes:
         paper: folder of its file; in a table of the user, any name.
         data: what the printed values were measured on.
+        lists: which lists the published rows were trained and their checkpoints selected on.
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
-        factor: x axis of the figure; None: no figure over a factor.
         forms: one sentence per form that says what the rows are run as.
         remarks: footnotes of the whole table, one sentence each.
         design: a factorial design whose rows follow `rows`.
     """
 
     paper: str
-    number: str
+    # YAML reads `number: 1` as a number.
+    number: Annotated[str, BeforeValidator(lambda n: str(n) if type(n) is int else n)]
     caption: str
     data: str
+    lists: str = ""
     unit: str = "percent"
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: str = "as trained"
     absent: Literal["released", "exclude"] | None = None
     columns: tuple[Column, ...]
-    factor: Factor | None = None
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -211,9 +201,9 @@ class Table(Strict):
     @model_validator(mode="after")
     def _check_names(self) -> Table:
         for each in (self.columns, self.rows, self.claims):
-            names = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
-            if len(set(names)) < len(names):
-                raise ValueError(f"'{max(names, key=names.count)}' is used twice.")
+            used = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
+            if len(set(used)) < len(used):
+                raise ValueError(f"'{max(used, key=used.count)}' is used twice.")
         released = (row.released.at for row in self.rows if row.released)
         for at in (self.at, *(row.at for row in self.rows), *released):
             for scale in at or ():
@@ -235,7 +225,7 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _check_rows(self) -> Table:
-        names = [each.name for each in self.columns]
+        columns = [each.name for each in self.columns]
         printed = [each.name for each in self.columns if each.printed]
         labels = [each.label for each in self.rows]
         for index, row in enumerate(self.rows):
@@ -243,12 +233,9 @@ class Table(Strict):
             if row.same_as is not None:
                 check_choice(f"{where}, same_as (an earlier row)", row.same_as, labels[:index])
             for name in row.without:
-                check_choice(f"{where}, without", name, names)
+                check_choice(f"{where}, without", name, columns)
             for name in (*row.values, *row.doubtful):
                 check_choice(f"{where}, printed column", name, printed)
-            is_log = self.factor is not None and self.factor.axis == "log"
-            if row.x is not None and (self.factor is None or (is_log and row.x <= 0)):
-                raise ValueError(f"{where}: 'x' needs a factor, and must be > 0 on a log axis.")
             for metric in (each.metric for each in self.columns if each.metric is not None):
                 for key in re.findall(r"{(\w+)}", metric):
                     check_choice(f"{where}, settings for '{metric}'", key, row.settings)
@@ -275,8 +262,8 @@ class Table(Strict):
             for label in (*claim.rows, *named):
                 check_choice(f"claim '{claim.name}', rows", label, labels)
             for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
-                names = [each.name for each in self.columns]
-                check_choice(f"claim '{claim.name}', columns", name, names)
+                columns = [each.name for each in self.columns]
+                check_choice(f"claim '{claim.name}', columns", name, columns)
             if not claim.columns or not any(True for _ in claim.pairs(labels)):
                 raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
         return self
@@ -304,3 +291,49 @@ class Table(Strict):
         experiment = chosen.experiment or row.experiment
         shared, own = (each.get(chosen_scale(scale, each), ()) for each in (self.at, at))
         return (f"+experiment={experiment}", *shared, *overrides, *own)
+
+    def headlines(self) -> list[Column]:
+        """Columns of `HEADLINES`, over all images or those of the day or the night."""
+        shown = {f"{part}{each}" for part in ("", "day/", "night/") for each in HEADLINES}
+        return [each for each in self.columns if each.metric in shown]
+
+    def both_forms(self) -> Table:
+        """With a row below each one that the release makes in another way, and claims about both.
+
+        The claims are that the released form scores higher; those of the paper are left out, as
+        they are about the rows of one form.
+
+        Raises:
+            InputError: no row has a released form of its own.
+        """
+        rows: list[Row] = []
+        claims: list[Claim] = []
+        scores = [each for each in self.columns if each.metric is not None]
+        for row in self.rows:
+            rows.append(row)
+            if row.released is None:
+                continue
+            label = f"{row.label}{RELEASED}"
+            own = {key: each for key, each in vars(row.released).items() if each is not None}
+            rows.append(
+                replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
+            )
+            claims += [
+                Claim(
+                    name=f"{label}, {column.name}",
+                    says=f"{row.label}: the released form has a higher {column.name}.",
+                    source="form=both",
+                    rows=(label,),
+                    against=(row.label,),
+                    columns=(column.name,),
+                    expected="higher",
+                )
+                for column in self.headlines() or scores
+                if column in self.columns_of(row)
+            ]
+        if not claims:
+            raise InputError(
+                f"form=both: no row of {self.paper}, {self.number} has a released form of its own; "
+                "use form=paper."
+            )
+        return replace(self, rows=tuple(rows), claims=tuple(claims))

@@ -1,22 +1,26 @@
 """Judges the claims of a table by its finished runs, and marks the rows that are shown to be best.
 
-A contrast is formed for each seed that all its rows have, because the runs of one seed share their
-initial weights and the order of their data.
+A claim is made of contrasts of rows, or of effects of a design. Each is a weighted sum of scores,
+formed for every seed that all its rows have, because the runs of one seed share their initial
+weights and the order of their data.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from statistics import fmean
+from typing import NamedTuple
 
 from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome
@@ -28,8 +32,10 @@ from sweeps.table.cells import (
     is_counted,
     metric_of,
     published,
+    world_evaluations,
 )
 from sweeps.table.claim import HIGHER, LOWER, Claim
+from sweeps.table.design import sign_of
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.table.table import Column, Row, Table
 
@@ -38,8 +44,6 @@ RESAMPLES = 2_000
 
 CellRunId = tuple[str, int]
 """(label of the row, seed); the seed of a row that was not trained here is `FIXED`."""
-
-UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ def _settings_of(run: RunResult) -> tuple[str, str, str]:
     """Kind of images, scale and initial weights of a run."""
     config = run.folder / "config.yaml"
     if not config.is_file():
-        return UNKNOWN, UNKNOWN, run.key
+        return "unknown", "unknown", run.key
     settings = read_settings(config)
     seed, scale = str(settings["seed"]), str(settings["scale"]["name"])
     images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
@@ -98,64 +102,61 @@ def _settings_of(run: RunResult) -> tuple[str, str, str]:
     return images, scale, "0" if is_common or is_file else seed
 
 
-@dataclass(frozen=True)
-class Contrast:
-    """A row minus another one in a column; or the difference of two such differences.
+class SameRunsError(InputError):
+    """Rows that are compared are the same scores of the same runs."""
 
-    Attributes:
-        row: its label.
-        other: label of the row that is subtracted; None: the score of `row` itself.
-        column: its name.
-        minus_column: column whose difference is subtracted; None: there is none.
-    """
 
+class Cell(NamedTuple):
+    """A score in a weighted sum: of a row in a column, tested in a `world` of its design or ""."""
+
+    weight: float
     row: str
-    other: str | None
     column: str
-    minus_column: str | None = None
+    world: str = ""
+
+
+class Contrast(NamedTuple):
+    """A weighted sum of cells, and how it is shown: "Ny/4 - CRM baseline, Var"."""
+
+    label: str
+    cells: tuple[Cell, ...]
 
     @property
-    def label(self) -> str:
-        """As shown: "Ny/4 - CRM baseline, Var"."""
-        columns = " - ".join(filter(None, (self.column, self.minus_column)))
-        return f"{' - '.join(self.rows)}, {columns}"
+    def rows(self) -> set[str]:
+        """Labels of its rows."""
+        return {cell.row for cell in self.cells}
 
-    @property
-    def rows(self) -> tuple[str, ...]:
-        """The labels of its rows."""
-        return (self.row,) if self.other is None else (self.row, self.other)
-
-    def cells(self) -> Iterator[tuple[float, str, str]]:
-        """(weight, row, column) of its cells."""
-        columns = [(1.0, self.column)]
-        columns += [] if self.minus_column is None else [(-1.0, self.minus_column)]
-        for weight, column in columns:
-            yield weight, self.row, column
-            if self.other is not None:
-                yield -weight, self.other, column
+    def printed(self, table: Table) -> float | None:
+        """The contrast of the printed values; None where one of them is not printed."""
+        rows = {row.label: row for row in table.rows}
+        columns = {column.name: column for column in table.columns}
+        total = 0.0
+        for weight, row, column, _ in self.cells:
+            value = published(rows[row], columns[column]) if row in rows else None
+            if value is None:
+                return None
+            total += weight * value
+        return total
 
 
 def contrasts_of(claim: Claim, table: Table) -> list[Contrast]:
     """The contrasts that a claim is made of, column by column; [] of one about a design."""
     labels = [row.label for row in table.rows if row.experiment is not None or row.values]
+    pairs = list(claim.pairs(labels))
     return [
-        Contrast(row, other, column, claim.minus_column)
+        difference(row, other, column, claim.minus_column)
         for column in (() if claim.effect else claim.columns)
-        for row, other in claim.pairs(labels)
+        for row, other in pairs
     ]
 
 
-def printed_value(contrast: Contrast, table: Table) -> float | None:
-    """The contrast of the printed values; None where one of them is not printed."""
-    rows = {row.label: row for row in table.rows}
-    columns = {column.name: column for column in table.columns}
-    total = 0.0
-    for weight, row, column in contrast.cells():
-        value = published(rows[row], columns[column])
-        if value is None:
-            return None
-        total += weight * value
-    return total
+def difference(row: str, other: str | None, column: str, minus: str | None = None) -> Contrast:
+    """A row less another (None: the row itself) in a column, less that in the column `minus`."""
+    columns = [(1.0, column), *([] if minus is None else [(-1.0, minus)])]
+    rows = [(1.0, row), *([] if other is None else [(-1.0, other)])]
+    cells = tuple(Cell(x * y, label, name) for x, name in columns for y, label in rows)
+    names = " - ".join(name for _, name in columns)
+    return Contrast(f"{' - '.join(label for _, label in rows)}, {names}", cells)
 
 
 def base_scores(table: Table, row: Row, name: str) -> Iterator[tuple[float, Column]]:
@@ -242,16 +243,19 @@ class TableJudge:
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
-        self._resampler = Resampler(Resampling(resamples=self.resamples, absent=self.table.absent))
+        settings = Resampling(resamples=self.resamples, absent=self.table.absent)
+        self.images = Resampler(settings)
+        # Of a design: generated scenes are independent, and those of a world have other labels.
+        self.worlds = Resampler(replace(settings, blocks="none"), "names")
 
     def claims(self, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
-        """Every claim about rows of the table, judged by the finished ones of `runs`."""
-        return [self.judge(claim, runs) for claim in self.table.claims if not claim.effect]
+        """Every claim of the table, judged by the finished ones of `runs`."""
+        return [self.judge(claim, runs) for claim in self.table.claims]
 
     def judge(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> JudgedClaim:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
-        contrasts = contrasts_of(claim, self.table)
-        printed = [printed_value(each, self.table) for each in contrasts]
+        contrasts = contrasts_of(claim, self.table) or self._effects(claim, runs)
+        printed = [each.printed(self.table) for each in contrasts]
         rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
         judged = partial(
@@ -268,14 +272,15 @@ class TableJudge:
             return judged(contrast=label, printed=printed[0], verdict=verdict, complete=True)
 
         mean = claim.combine == "mean"
-        groups = [[(1.0, each)] for each in contrasts]
-        if mean:
-            groups = [[(1 / len(contrasts), each) for each in contrasts]]
+        groups = [contrasts] if mean else [[each] for each in contrasts]
         evidences: dict[int, Evidence] = {}
         reasons: list[str] = []
         for index, group in enumerate(groups):
             try:
-                evidences[index] = self.evidence(group, runs)
+                terms = [term for each in group for term in self.terms(each.cells, runs)]
+                scaled = [replace(each, weight=each.weight / len(group)) for each in terms]
+                engine = self.worlds if claim.effect else self.images
+                evidences[index] = engine.evidence(scaled)
             except InputError as error:
                 reasons.append(str(error))
         if not evidences:
@@ -300,33 +305,73 @@ class TableJudge:
             basis=basis,
         )
 
+    def _effects(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> list[Contrast]:
+        """An effect on each method and outcome, in worlds it is tested in, else trained in."""
+        design = self.table.design
+        assert design is not None, "a claim about an effect is about a design"
+        found = []
+        for method, outcome in product(claim.rows, claim.columns):
+            labels = {
+                part: [row for row, _ in design.places(part, method)] for part in design.parts
+            }
+            is_run = [all(finished_runs_of(row, runs) for row in each) for each in labels.values()]
+            part = list(labels)[is_run.index(True) if any(is_run) else 0]
+            signs = [sign_of(levels, claim.effect) for levels in design.cells(part)]
+            cells = tuple(
+                Cell(2 * sign / len(signs), row, outcome, world)
+                for sign, (row, world) in zip(signs, design.places(part, method), strict=True)
+            )
+            label = f"{method}, {outcome}: {claim.effect}+ - {claim.effect}- ({part})"
+            found.append(Contrast(label, cells))
+        return found
+
     def _exact(self, contrast: Contrast) -> float | None:
         """The value of a contrast of exact cells; None where one of them is not."""
-        cells = [(weight, self.sizes.get((row, name))) for weight, row, name in contrast.cells()]
-        known = [weight * cell.mean for weight, cell in cells if cell is not None]
-        return sum(known) if len(known) == len(cells) else None
+        sizes = [self.sizes.get((cell.row, cell.column)) for cell in contrast.cells]
+        pairs = zip(contrast.cells, sizes, strict=True)
+        total = math.fsum(
+            math.nan if size is None else cell.weight * size.mean for cell, size in pairs
+        )
+        return None if math.isnan(total) else total
 
-    def evidence(
-        self, contrasts: Sequence[tuple[float, Contrast]], runs: Mapping[CellRunId, Outcome]
-    ) -> Evidence:
-        """What finished runs say about a weighted sum of contrasts.
+    def terms(self, cells: Sequence[Cell], runs: Mapping[CellRunId, Outcome]) -> list[Term]:
+        """The scores of counts, by seed, that a weighted sum of cells is made of.
 
         Raises:
-            InputError: a row without a finished run, two rows of the same runs, or counts that
-                cannot be compared.
+            InputError: a row without a finished run or the score, or rows of the same runs.
         """
-        for _, contrast in contrasts:
-            if contrast.other is not None and self._is_same(contrast, runs):
-                raise InputError(
-                    f"rows '{contrast.row}' and '{contrast.other}' are the same runs at this scale."
-                )
-        terms = [
-            term
-            for weight, contrast in contrasts
-            for part, row, column in contrast.cells()
-            for term in self._terms(weight * part, row, column, runs)
-        ]
-        return self._resampler.evidence(terms)
+        found = [term for cell in cells for term in self._terms(cell, runs)]
+        sums: dict[tuple[str, ...], float] = {}
+        for term in found:
+            source = (term.metric, *term.keys.values())
+            sums[source] = sums.get(source, 0.0) + term.weight
+        if not any(sums.values()):
+            rows = " and ".join(dict.fromkeys(f"'{cell.row}'" for cell in cells))
+            raise SameRunsError(f"rows {rows} are the same runs at this scale.")
+        return found
+
+    def _terms(self, cell: Cell, runs: Mapping[CellRunId, Outcome]) -> Iterator[Term]:
+        row = self._rows.get(cell.row)
+        finished = finished_runs_of(cell.row, runs)
+        if row is None or not finished:
+            raise InputError(f"row '{cell.row}' has no finished run.")
+        if cell.column not in {column.name for column in self.table.columns_of(row)}:
+            raise InputError(f"row '{cell.row}' has no score '{cell.column}'.")
+        for part, column in base_scores(self.table, row, cell.column):
+            if not is_counted(column):
+                raise InputError(f"column '{column.name}' is not a score of images.")
+            path = counts_path(column, self.table)
+            if cell.world:
+                plain = Column(name=names.MIOU, metric=names.MIOU)
+                if path != counts_path(plain, self.table):
+                    raise InputError(f"'{column.name}' is no score of the plain test images.")
+                path = world_evaluations(self.table, row)[cell.world].path
+            yield Term(
+                weight=cell.weight * part,
+                metric=metric_of(column, row),
+                counts={seed: self.stored.counts(run, path) for seed, run in finished.items()},
+                keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
+            )
 
     def marks(self, scored: ScoredTable, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:
         """Rank 1 of a row that is shown to be better than all others of a column; 2 the next.
@@ -364,55 +409,21 @@ class TableJudge:
             return []
         highest = column.best == "highest"
         best = (max if highest else min)(means, key=lambda label: means[label])
-        same = [each for each in means if self._is_same(Contrast(best, each, column.name), runs)]
-        others = [Contrast(best, label, column.name) for label in means if label not in same]
-        try:
-            shown = [self.evidence([(1.0, each)], runs) for each in others]
-        except InputError:
-            return []
         wanted = HIGHER if highest else LOWER
-        is_best = bool(shown) and decide(shown, wanted, self.rule, "all").kind == "holds"
-        return same if is_best else []
-
-    def _is_same(self, contrast: Contrast, runs: Mapping[CellRunId, Outcome]) -> bool:
-        """Whether both rows of a contrast are the same scores of the same runs."""
-        keys = [
-            {run.key for run in finished_runs_of(label, runs).values()} for label in contrast.rows
-        ]
-        metrics = [
-            [metric_of(base, self._rows[label]) for base in self._bases(contrast, label)]
-            for label in contrast.rows
-        ]
-        return bool(keys[0]) and keys[0] == keys[-1] and metrics[0] == metrics[-1]
-
-    def _bases(self, contrast: Contrast, label: str) -> list[Column]:
-        names = {column for _, _, column in contrast.cells()}
-        present = {each.name for each in self.table.columns_of(self._rows[label])}
-        return [
-            base
-            for name in sorted(names & present)
-            for _, base in base_scores(self.table, self._rows[label], name)
-        ]
-
-    def _terms(
-        self, weight: float, label: str, name: str, runs: Mapping[CellRunId, Outcome]
-    ) -> Iterator[Term]:
-        row = self._rows[label]
-        if name not in {column.name for column in self.table.columns_of(row)}:
-            raise InputError(f"row '{label}' has no score '{name}'.")
-        finished = finished_runs_of(label, runs)
-        if not finished:
-            raise InputError(f"row '{label}' has no finished run.")
-        for part, column in base_scores(self.table, row, name):
-            if not is_counted(column):
-                raise InputError(f"column '{column.name}' is not a score of images.")
-            path = counts_path(column, self.table)
-            yield Term(
-                weight=weight * part,
-                metric=metric_of(column, row),
-                counts={seed: self.stored.counts(run, path) for seed, run in finished.items()},
-                keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
-            )
+        same = [best]
+        # The nearest row first: if it cannot be told apart, the others need no interval.
+        for label in sorted(means.keys() - {best}, key=lambda each: abs(means[each] - means[best])):
+            cells = difference(best, label, column.name).cells
+            try:
+                shown = self.images.evidence(self.terms(cells, runs))
+            except SameRunsError:
+                same.append(label)
+                continue
+            except InputError:
+                return []
+            if decide([shown], wanted, self.rule, "all").kind != "holds":
+                return []
+        return same if len(same) < len(means) else []
 
 
 def finished_runs_of(label: str, runs: Mapping[CellRunId, Outcome]) -> dict[int, RunResult]:

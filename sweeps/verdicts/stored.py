@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import get_args
 
 from rgbt.checks import InputError
 from rgbt.runs.result import RunResult
-from rgbt.tables import TextTable
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import ScoredTable, TableCell, score, size_marks
-from sweeps.table.efficiency import exact_sizes
+from sweeps.table.cells import ScoredTable, score, size_marks
+from sweeps.table.efficiency import network_sizes
 from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import DEFAULT_SCALE, TAG, TableRequest
-from sweeps.table.table import Form, Table
-from sweeps.verdicts.effects import DesignEffects, DesignJudge, judged_claims
-from sweeps.verdicts.forms import RELEASED, forms_grid
+from sweeps.table.table import RELEASED, Form, Table
+from sweeps.verdicts.effects import Effects, effects_of
 from sweeps.verdicts.judge import (
     RESAMPLES,
     CellRunId,
@@ -33,17 +32,17 @@ SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 
 
 class FinishedRuns:
-    """Finished runs by seed and key, and their experiments; one that is odd is a remark."""
+    """Finished runs by seed and key, and the seeds of experiments; one that is odd is a remark."""
 
     def __init__(self, runs: Iterable[RunResult]) -> None:
         self.by_seed: dict[int, dict[str, RunResult]] = {}
-        self.experiments: set[str] = set()
+        self.seeds: dict[str, set[int]] = {}
         self.remarks: list[str] = []
         for run in runs:
             try:
-                tags = run.tags
-                self.by_seed.setdefault(int(tags[SEED]), {})[run.key] = run
-                self.experiments.add(tags[EXPERIMENT])
+                seed, experiment = int(run.tags[SEED]), run.tags[EXPERIMENT]
+                self.by_seed.setdefault(seed, {})[run.key] = run
+                self.seeds.setdefault(experiment, set()).add(seed)
             except (InputError, KeyError, ValueError, TypeError) as error:
                 self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
 
@@ -65,11 +64,12 @@ def stored_runs(
     errors, rows = [], request.trained_rows
     for row in rows:
         words = request.overrides(row.label, 0)
-        if not checked and words[0].removeprefix("+experiment=") not in finished.experiments:
+        seeds = finished.seeds.get(words[0].removeprefix("+experiment="), set())
+        if not checked and not seeds:
             continue
         try:
             spec = planner.specify((*planner.base, *words), checked=checked)
-            keys = {seed: spec.with_seed(seed).key for seed in finished.by_seed}
+            keys = {seed: spec.with_seed(seed).key for seed in seeds}
         except InputError as error:
             errors.append(error)
             continue
@@ -81,46 +81,34 @@ def stored_runs(
     return runs
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TableResult:
-    """What the finished runs of a table show.
-
-    Attributes:
-        claims: judged.
-        forms: differences of the forms as text; None where one form was run.
-        effects: of the factors of its design; None where it has none.
-    """
+    """What the finished runs of a table show."""
 
     request: TableRequest
     runs: Mapping[CellRunId, Outcome]
-    scored: ScoredTable
-    claims: Sequence[JudgedClaim] = ()
-    forms: TextTable | None = None
-    effects: DesignEffects | None = None
+    judge: TableJudge
 
-    @classmethod
-    def of(
-        cls,
-        request: TableRequest,
-        runs: Mapping[CellRunId, Outcome],
-        judge: TableJudge,
-        sizes: Mapping[tuple[str, str], TableCell],
-    ) -> TableResult:
-        """Score a table and judge it; `sizes` are cells of efficiency."""
-        table = request.table
+    @cached_property
+    def scored(self) -> ScoredTable:
+        """Our values, with marks of the best rows."""
+        request, judge, runs = self.request, self.judge, self.runs
+        reader = judge.stored.counts
         scored = score(
-            request.name, table, runs, scale=request.scale, sizes=sizes, reader=judge.stored.counts
+            request.name, request.table, runs, scale=request.scale, sizes=judge.sizes, reader=reader
         )
-        marks = judge.marks(scored, runs) | size_marks(table, sizes)
-        design = DesignJudge(table, judge.resamples, judge.rule, judge.stored)
-        return cls(
-            request=request,
-            runs=runs,
-            scored=replace(scored, form=request.form, marks=marks),
-            claims=judged_claims(judge, runs),
-            forms=forms_grid(judge, runs),
-            effects=None if table.design is None else design.effects(runs),
-        )
+        marks = judge.marks(scored, runs) | size_marks(request.table, judge.sizes)
+        return replace(scored, form=request.form, marks=marks)
+
+    @cached_property
+    def claims(self) -> list[JudgedClaim]:
+        """The claims of the table, judged."""
+        return self.judge.claims(self.runs)
+
+    @cached_property
+    def effects(self) -> Effects | None:
+        """Of the factors of its design; None where it has none."""
+        return None if self.request.table.design is None else effects_of(self.judge, self.runs)
 
 
 @dataclass(frozen=True, order=True)
@@ -132,9 +120,20 @@ class Variant:
     extra: tuple[str, ...] = ()
 
 
+def known_tables(own: Path, remarks: list[str]) -> dict[str, Table]:
+    """All tables of the papers, of ours, and of the user; one that is not read is a remark."""
+    tables = {}
+    for name in dict.fromkeys([*table_names(own), *study_names()]):
+        try:
+            tables[name] = load_table(name, own)
+        except InputError as error:
+            remarks.append(f"Table '{name}' is left out: {error}")
+    return tables
+
+
 @dataclass
 class TableResults:
-    """The results of all tables of the papers, of ours, and of the user.
+    """The results of tables.
 
     Attributes:
         finished: the runs; a run belongs to every table with a row of its key.
@@ -146,20 +145,14 @@ class TableResults:
 
     finished: FinishedRuns
     planner: Planner
-    own: Path
+    tables: Mapping[str, Table] = field(default_factory=dict)
     resamples: int = RESAMPLES
     counted: bool = False
     remarks: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.tables: dict[str, Table] = {}
         self.stored = StoredRuns()
         self.remarks += self.finished.remarks
-        for name in dict.fromkeys([*table_names(self.own), *study_names()]):
-            try:
-                self.tables[name] = load_table(name, self.own)
-            except InputError as error:
-                self.remarks.append(f"Table '{name}' is left out: {error}")
 
     def variants(self) -> dict[str, list[Variant]]:
         """Name of every table that runs are tagged with -> how it was run."""
@@ -200,21 +193,26 @@ class TableResults:
         Raises:
             InputError: no row can be composed.
         """
-        chosen = variant or Variant()
-        request = TableRequest(
-            name, self.tables[name], chosen.scale, (0,), chosen.extra, form=chosen.form
-        )
-        runs = stored_runs(request, self.finished, self.planner) if variant else {}
-        sizes = exact_sizes(request) if self.counted else {}
-        judge = TableJudge(
-            name,
-            request.table,
-            rule_of(result for run in runs.values() for result in run.results),
-            self.resamples,
-            sizes,
-            self.stored,
-        )
-        return TableResult.of(request, runs, judge, sizes)
+        how = variant or Variant()
+        table = self.tables[name]
+        request = TableRequest(name, table, how.scale, (0,), how.extra, form=how.form)
+        return self.result(request, {} if variant is None else None)
+
+    def result(
+        self,
+        request: TableRequest,
+        runs: Mapping[CellRunId, Outcome] | None = None,
+        *,
+        checked: bool = False,
+    ) -> TableResult:
+        """The result of a request; None: of all finished `runs`, see `stored_runs`."""
+        if runs is None:
+            runs = stored_runs(request, self.finished, self.planner, checked=checked)
+        sizes = network_sizes(request) if self.counted else {}
+        rule = rule_of(result for run in runs.values() for result in run.results)
+        name, table = request.name, request.table
+        judge = TableJudge(name, table, rule, self.resamples, sizes, self.stored)
+        return TableResult(request, runs, judge)
 
     def __iter__(self) -> Iterator[TableResult]:
         """Tables with runs in every way that they were run, then those without a run.
@@ -227,7 +225,9 @@ class TableResults:
             found = []
             for variant in sorted({*variants.get(name, ()), *plain}):
                 try:
-                    found.append(self.of(name, variant))
+                    result = self.of(name, variant)
+                    _ = result.runs and (result.scored, result.claims)  # an error is a remark here
+                    found.append(result)
                 except InputError as error:
                     self.remarks.append(f"Table '{name}' cannot be scored: {error}")
             found = [result for result in found if result.runs]

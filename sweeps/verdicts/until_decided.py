@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sweeps.point import Outcome, Point
+from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, contrasts_of
 
@@ -55,7 +56,7 @@ class SeedsUntilDecided:
         self._seen = finished
         wanted: dict[CellRunId, None] = {}
         for judged in self.judge.claims({**runs, **self.external}):
-            labels = self._trained(judged)
+            labels = self._trained(judged.claim)
             own = {each: run for each, run in runs.items() if each[0] in labels}
             unfinished = {seed for (_, seed), run in own.items() if run.state != "finished"}
             is_failed = any(run.state == "failed" for run in own.values())
@@ -71,19 +72,15 @@ class SeedsUntilDecided:
         """Every point that may be run: `max_seeds` of rows of claims, `START` of others."""
         if not self.request.row_seeds():
             return []
-        claims = self.request.table.claims
-        contrasts = (each for claim in claims for each in contrasts_of(claim, self.request.table))
-        named = {label for each in contrasts for label in each.rows}
-        most = {
-            row.label: self.max_seeds if row.label in named else START
-            for row in self.request.trained_rows
-        }
+        named = {label for claim in self.request.table.claims for label in self._trained(claim)}
+        rows = (row.label for row in self.request.trained_rows)
+        most = {label: self.max_seeds if label in named else START for label in rows}
         pairs = [(label, seed) for label, count in most.items() for seed in range(count)]
         return self.request.points(pairs)
 
-    def _trained(self, judged: JudgedClaim) -> list[str]:
+    def _trained(self, claim: Claim) -> list[str]:
         """Labels of the trained rows of a claim."""
-        contrasts = contrasts_of(judged.claim, self.request.table)
+        contrasts = contrasts_of(claim, self.request.table)
         named = {label for each in contrasts for label in each.rows}
         return [row.label for row in self.request.trained_rows if row.label in named]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -31,10 +32,11 @@ def some(seed: int, **changed: object) -> Counts:
 PAIRS = counts_of(np.random.default_rng(9).integers(0, 9, (12, 15, 4, 4)), partition="aligned3")
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunResult:
-    """A finished run folder without weights, as `rgbt.training.train` writes it."""
-    spec = specified((*WORDS, f"runs_dir={tmp_path}/runs"))
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """A finished run folder without weights, as a training writes it, and its archive."""
+    root = tmp_path_factory.mktemp("made")
+    spec = specified((*WORDS, f"runs_dir={root}/runs"))
     folder = RunFolder(spec.folder)
     folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
     folder.describe(describe(spec))
@@ -45,11 +47,24 @@ def run(tmp_path: Path) -> RunResult:
     PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
     write_levels(folder.path / "evaluations/robustness/test", SCORES)
     folder.finish({"key": spec.key, "dataset": "abc", "test": {"mIoU": 0.5}})
+    add(RunResult(folder.path), root / "results")
     return RunResult(folder.path)
 
 
+@pytest.fixture
+def run(made: RunResult, tmp_path: Path) -> RunResult:
+    """A copy in ``runs/``; its archive is in ``results/``."""
+    shutil.copytree(made.folder.parents[1] / "results", tmp_path / "results")
+    return RunResult(Path(shutil.copytree(made.folder, tmp_path / "runs" / made.key)))
+
+
+def archived_in(folder: Path) -> Path:
+    (path,) = archived(folder / "results")
+    return path
+
+
 def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
-    unpacked = unpack(add(run, tmp_path / "results"), tmp_path / "unpacked")
+    unpacked = unpack(archived_in(tmp_path), tmp_path / "unpacked")
     paths = [path for end in ("npz", "json") for path in sorted(run.folder.rglob(f"*.{end}"))]
     names = {path.relative_to(run.folder).as_posix() for path in paths}
     assert names == {
@@ -91,7 +106,6 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
     wrong = some(0).counts.copy()
     wrong[..., 0, 1] += 1  # another prediction of a pixel with the same label
     wrong[..., 0, 0] -= 1
-    add(run, tmp_path / "results")
     before = len(list((tmp_path / "results/shared").iterdir()))
     replace(some(0), counts=wrong).save(run.folder / "counts_test.npz")
     add(run, tmp_path / "results")
@@ -100,7 +114,7 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("damage", [0.3, 0.6, "shared", "/tmp/outside.txt", "../outside.txt"])
 def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: float | str) -> None:
-    path = add(run, tmp_path / "results")
+    path = archived_in(tmp_path)
     shared, other = sorted((tmp_path / "results/shared").iterdir())[:2]
     if isinstance(damage, float):
         content = bytearray(path.read_bytes())
@@ -119,7 +133,7 @@ def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: floa
 
 
 def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:
-    path = add(run, tmp_path / "results")
+    path = archived_in(tmp_path)
     path.rename(path.with_name("0123456789ab.zip"))
     with pytest.raises(InputError, match=f"holds the run {run.key}"):
         unpack(path.with_name("0123456789ab.zip"), tmp_path / "unpacked")
@@ -148,7 +162,7 @@ def write_settings(run: RunResult, **changed: object) -> None:
 def test_check_reports_changed_keys(
     call: Call, run: RunResult, tmp_path: Path, changed: dict[str, object], state: str, reason: str
 ) -> None:
-    archive = tmp_path / "results"
+    archive = tmp_path / "other"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
     some(0, run="0123456789ab").save(folder / "counts_test.npz")
@@ -166,7 +180,7 @@ def test_check_reports_changed_keys(
 
 
 def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Path) -> None:
-    archive = tmp_path / "results"
+    archive = tmp_path / "new"
     words = (f"runs_dir={run.folder.parent}", f"archive={archive}")
     assert call(entry, "add", "run=all", *words)[0] == 0
     assert [each.stem for each in archived(archive)] == [run.key]

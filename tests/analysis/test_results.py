@@ -11,13 +11,23 @@ import numpy as np
 import pytest
 
 from analysis.archive import add
-from analysis.results import COLUMNS, finished_runs, label_of, open_counts, results
+from analysis.results import (
+    CLEAN,
+    COLUMNS,
+    ROBUSTNESS,
+    finished_runs,
+    label_of,
+    open_counts,
+    results,
+    trainings,
+)
 from rgbt.checks import InputError
+from rgbt.evaluation import robustness
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
 from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.runs.result import RunResult
-from tests.analysis.robust_runs import SCORES, write_levels
+from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
 
 CRM, COMMAS = "crm scale=demo", "grbm scale=demo sizes=[1,2]"
@@ -116,14 +126,8 @@ def test_folder_of_scores_is_opened_by_rings(tmp_path: Path) -> None:
     ("text", "options", "word"),
     [
         ("aab0", {}, "'aab0' is not a run.*crm scale=demo"),
-        ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
         (f"{LONG}1", {}, "is not a run"),
-        ("abc", {"runs_dir": "none"}, "'abc' is not a run"),
         ("crm", {"runs_dir": "none"}, "is not a run .* nor counts"),
-        ("none.npz", {}, "the file of counts"),
-        ("images.npz", {}, "is not a readable file of counts"),
-        ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
-        ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
         ("aaa0,mlflow-aaa0", {}, "names the same counts twice"),
         (f"{CRM},aaa1", {}, "names the same counts twice"),
@@ -135,7 +139,6 @@ def test_other_inputs_and_repeated_runs_are_refused(
     runs: Path, text: str, options: dict[str, str], word: str
 ):
     some(7).save(runs.parent / "copy.npz")
-    np.savez(runs.parent / "images.npz", x=np.zeros(3))
     if "ggg0" in text:
         some(77).save(make_run(runs, "ggg0", CRM, 0) / "counts_test.npz")
     with pytest.raises(InputError, match=word):
@@ -229,3 +232,47 @@ def test_damaged_run_is_a_remark(runs: Path, capsys: pytest.CaptureFixture[str],
     assert "bbb1" not in keys
     assert {"bbb0", "aaa1"} <= keys
     assert capsys.readouterr().err.count("warning") == 1
+
+
+# Corrupted images.
+
+
+@pytest.fixture
+def measured(tmp_path: Path) -> Path:
+    write_run(tmp_path, "k0", "crm", 0, SCORES)
+    write_run(tmp_path, "k1", "crm", 1, less(10))
+    write_run(tmp_path, "k2", "none", 0, less(5))
+    return tmp_path
+
+
+def test_trainings_have_levels_by_title_and_rising_severity(measured: Path) -> None:
+    assert (CLEAN, ROBUSTNESS) == (robustness.CLEAN, robustness.FOLDER)
+    first, second = trainings("crm", measured)
+    assert [level.path.stem for level in first.levels] == [
+        *("clean", "rgb_removed-1", "features-thermal", "noise-8", "noise-16")
+    ]
+    mious = [value("mIoU", level.counts, "released") for level in first.levels]
+    assert mious == pytest.approx([80, 20, 30, 60, 40], abs=1e-3)
+    assert value("mIoU", second.levels[0].counts, "released") == pytest.approx(70, abs=1e-3)
+    assert [level.severity for level in first.levels if level.row == "noise"] == [8.0, 16.0]
+    assert "frozen" not in {level.row for level in first.levels}
+    folder = write_levels(measured / "elsewhere", SCORES)
+    assert [each.label for each in trainings(f"{folder},k2", measured)] == ["elsewhere", "none"]
+
+
+@pytest.mark.parametrize(
+    ("condition", "miou"), [("noise 16", 40), ("rgb_removed", 20), ("removed:rgb 1", 20)]
+)
+def test_same_trainings_on_corrupted_images(measured: Path, condition: str, miou: int) -> None:
+    found = open_counts("crm", measured, condition=condition)
+    assert [value("mIoU", each.counts, "released") for each in found] == pytest.approx(
+        [miou, miou - 10], abs=1e-3
+    )
+    assert [each.seed for each in found] == [0, 1]
+
+
+@pytest.mark.parametrize("condition", ["nois 16", "noise 12", "noise"])
+def test_missing_condition_is_reported(measured: Path, condition: str) -> None:
+    known = "clean, features-thermal 1, noise 16, noise 8, rgb_removed 1"
+    with pytest.raises(InputError, match=f"condition={condition} is not counted .* has {known}"):
+        open_counts("k0", measured, condition=condition)

@@ -149,7 +149,7 @@ def test_part_that_fits_passes(write_mfnet: WriteMFNet) -> None:
     assert not contracts.is_own(MFNet(str(write_mfnet({"train": ["00001D"]}))))
 
 
-def test_network_is_looked_at_once_in_training_and_once_in_evaluation() -> None:
+def test_network_is_examined_once_in_training_and_in_evaluation() -> None:
     net = Net(Output(None, {"masks": RGB}), outputs="masks")
     net(RGB, RGB[:, :1])
     assert "returned logits None; expected" in refused(lambda: net.eval()(RGB, RGB[:, :1]))

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,7 +52,24 @@ def composed(words: Callable[..., list[str]]) -> Composed:
     return make
 
 
-def test_rare_classes_are_those_of_the_source_as_it_is_labelled(
+def test_class_weights_are_those_of_the_training_split(composed: Composed) -> None:
+    """Of the loss, and of a loss inside another one; numbers do not read a label."""
+    spec = composed("start_deeplabv2", "loss.class_weights=inverse")
+    setup = set_up_training(spec)
+    data = setup.session.dataset
+    labels = [data.label(name) for name in data.names("train_day")]
+    pixels = np.bincount(np.ravel(labels), minlength=256)[: data.num_classes]
+    expected = [pixels.sum() / len(pixels) / each if each else 0 for each in pixels]
+    assert setup.scheme.loss.class_weights == pytest.approx(expected)  # type: ignore[attr-defined]
+    inner = ["loss=cross_entropy_auxiliary", "model.auxiliary=true", "loss.loss.class_weights=enet"]
+    nested = set_up_training(composed("start_deeplabv2", *inner)).scheme.loss.loss  # type: ignore[attr-defined]
+    assert len(nested.class_weights) == data.num_classes
+    taught = ["domains.source.labels=experiment:thermal_teacher/best.pt", "loss.class_weights=enet"]
+    with pytest.raises(InputError, match=r"loss\.class_weights: expected numbers"):
+        set_up_training(composed("start_deeplabv2", *taught), upstream_finished=False)
+
+
+def test_rare_classes_follow_the_labels_of_the_source(
     composed: Composed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Target images and upstream runs are shuffled; an upstream run has the batch size."""
@@ -184,7 +202,7 @@ def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> N
 
 
 @pytest.mark.parametrize(("source", "changed"), [("weights", 0), ("order", 1), ("masks", None)])
-def test_seed_of_a_source_changes_what_is_drawn_from_it_alone(
+def test_seed_of_source_changes_only_its_own_draws(
     composed: Composed, source: str, changed: int | None
 ) -> None:
     def drawn(*more: str) -> tuple[list[torch.Tensor], list[torch.Tensor]]:

@@ -16,7 +16,7 @@ from rgbt.checkpoints.load import load_weights, plan_for
 from rgbt.config.component import build
 from tests.models import golden
 
-FAST = ("mfnet", "cmx_mit_b0", "temporal_cmx_b2", "cmnext_b0")
+FAST = ("mfnet", "cmx_mit_b0")
 SCORES = {"crm": "sem_seg"}
 """Name of the recorded class scores, where it is not "logits"."""
 

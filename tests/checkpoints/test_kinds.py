@@ -84,9 +84,7 @@ def test_timm_swin_has_the_merging_in_the_next_stage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("yaml", ["cmx_tiny", "cmnext_tiny"])
-def test_imagenet_mit_fills_both_streams_of_cmx_and_one_of_cmnext(
-    tmp_path: Path, yaml: str
-) -> None:
+def test_imagenet_mit_fills_streams_of_cmx_and_cmnext(tmp_path: Path, yaml: str) -> None:
     model = network(yaml, **MIT)
     before = {key: value.clone() for key, value in model.state_dict().items()}
     load_weights(model, saved(tmp_path, mit_file()))
@@ -99,7 +97,7 @@ def test_imagenet_mit_fills_both_streams_of_cmx_and_one_of_cmnext(
             assert torch.equal(value, before[key]), key
 
 
-def test_the_thermal_stem_of_rtfnet_is_the_mean_or_drawn_anew(tmp_path: Path) -> None:
+def test_thermal_stem_of_rtfnet_is_mean_or_drawn_anew(tmp_path: Path) -> None:
     tensors = resnet_file(18, counters=False, width=4)
     stem = torch.arange(4 * 3 * 49.0).reshape(4, 3, 7, 7)
     tensors["conv1.weight"] = stem
@@ -147,7 +145,7 @@ def test_a_resnet_fills_the_encoder_of_pspnet(tmp_path: Path, modalities: str) -
     assert ("feats.layer3.0.conv1.weight" in plan.fresh) == two
 
 
-def test_the_deep_stem_of_semseg_is_filled_by_its_own_file_alone(tmp_path: Path) -> None:
+def test_only_own_file_fills_deep_stem_of_semseg(tmp_path: Path) -> None:
     """resnet50_v2.pth: conv1 to conv3 and bn1 to bn3 before the stages."""
     model, deep = network("semseg_tiny", 14, depths="[3,4,6,3]"), deep_resnet_file(8)
     plan, state = load_weights(model, saved(tmp_path, deep)), model.state_dict()

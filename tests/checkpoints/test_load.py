@@ -111,7 +111,7 @@ def test_another_number_of_classes(tmp_path: Path, yaml: str, prefix: str, part:
             assert torch.equal(value, before[key]) if is_kept else holds(value, prefix + key)
 
 
-def test_tensors_that_are_one_in_the_network_and_two_in_the_file(tmp_path: Path) -> None:
+def test_two_tensors_of_the_file_become_one(tmp_path: Path) -> None:
     apart, one = network("mask2former_tiny"), network("mask2former_tiny", share_start=2)
     path = saved(tmp_path, {f"network.{k}": v for k, v in apart.state_dict().items()})
     assert "are one in the network but differ in the file" in refused(one, path)

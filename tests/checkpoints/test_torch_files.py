@@ -70,7 +70,7 @@ def same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 
-def test_what_is_saved_is_loaded_by_us_and_by_torch(tmp_path: Path) -> None:
+def test_saved_file_is_loaded_by_us_and_torch(tmp_path: Path) -> None:
     path, content = tmp_path / "last.pt", payload()
     save(path, content)
     assert same(load_checkpoint(path), content)
@@ -150,7 +150,7 @@ def test_damaged_files_of_others_raise_one_kind_of_error(tmp_path: Path) -> None
         assert 5 < refused < 100
 
 
-def test_a_tensor_of_another_shape_or_type_than_its_place_is_refused(tmp_path: Path) -> None:
+def test_tensor_of_other_shape_or_type_is_refused(tmp_path: Path) -> None:
     model, weights = trained()[0], payload()["model"]
     name = "0.weight"
     for wrong in (weights[name].double(), weights[name].mT[:, :3], weights[name].to_sparse(), "x"):
@@ -189,9 +189,7 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
         run.load_best(replace(state, key="c"))
 
 
-def test_a_file_that_cannot_be_written_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "last.pt"
     save(path, {"model": {}})
     before = path.read_bytes()

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build, setting_types
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import available, conf_dir
 from rgbt.config.values import check_value
 from rgbt.ranges import Pixels, Share
 from rgbt.runs.run_spec import NODES, Values
@@ -32,10 +32,6 @@ class Knob:
     model: object = None
 
 
-def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-
-
 @pytest.fixture(scope="module")
 def default() -> DictConfig:
     """The whole configuration, of which one node at a time is exchanged."""
@@ -43,7 +39,7 @@ def default() -> DictConfig:
 
 
 @pytest.mark.parametrize(
-    ("group", "option"), [(g, o) for g in NODES if g != "scale" for o in options(g)]
+    ("group", "option"), [(g, o) for g in NODES if g != "scale" for o in available(g)]
 )
 def test_every_option_of_every_group_passes_the_check(
     group: str, option: str, default: DictConfig
@@ -51,6 +47,8 @@ def test_every_option_of_every_group_passes_the_check(
     needed = {} if group != "dataset" or option.startswith("synth") else {"root": "unused"}
     if option == "folder":
         needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
+    if option == "cart":
+        needed |= {"thermal_range": "[0,9]"}
     words = [f"dataset.{key}={needed[key]}" for key in needed]
     if option == "external":
         words = ["model.checkout=unused", "model.constructor=a:B"]
@@ -64,7 +62,7 @@ def test_every_option_of_every_group_passes_the_check(
     assert component.target == component.plain["_target_"] == chosen[group]["_target_"]
 
 
-def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
+def test_node_is_built_with_converted_values_and_offered_objects() -> None:
     inner = {"_target_": f"{__name__}.Knob", "size": [3, 4], "kind": "b"}
     node = OmegaConf.create({"knob": {**inner, "kind": "a", "inner": inner}}).knob
     offered = object()

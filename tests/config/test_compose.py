@@ -48,6 +48,42 @@ def test_available_lists_the_search_path_of_the_command(
     assert compose(["+experiment=own_stage"]).name == "own_stage"
 
 
+VARIED = """\
+defaults: [{inputs: cmx}, _self_]
+_target_: rgbt.models.mfnet.MFNet
+num_classes: ${dataset.num_classes}
+widths: [1, 2, 3]
+part: {a: 1, b: 2}
+_variants_:
+  18: {widths: [4]}
+  big_one: {part: {b: "${seed}"}, defaults: [{inputs: half_three}, _self_]}
+"""
+
+
+def test_a_file_holds_several_choices(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (own / "model").mkdir()
+    (own / "model" / "my_net.yaml").write_text(VARIED)
+    (own / "model" / "other.yaml").write_text(f"{VARIED}  mid: null\n")
+    monkeypatch.setenv("RGBT_CONF", str(own))
+    names = {"my_net", "my_net_18", "my_net_big_one", "other_18", "other_big_one", "other_mid"}
+    listed = {each for each in available("model") if each.startswith(("my_net", "other"))}
+    assert listed == names  # a variant without values is the name of the file's own
+    found = {each: compose([f"model={each}", "seed=7"]).model for each in sorted(names)}
+    assert found["my_net"] == found["other_mid"]
+    assert "_variants_" not in found["my_net"]
+    assert found["my_net"].num_classes == 9
+    assert (found["my_net"].widths, found["my_net_18"].widths) == ([1, 2, 3], [4])
+    assert (found["my_net"].part, found["other_big_one"].part) == (
+        {"a": 1, "b": 2},
+        {"a": 1, "b": 7},
+    )
+    assert found["my_net_18"].inputs.thermal_mean == found["my_net"].inputs.thermal_mean
+    assert found["my_net_big_one"].inputs.thermal_mean == [127.5] * 3
+    for name in ("other", "my_net_19", "net_18"):
+        with pytest.raises(InputError, match=f"there is no model '{name}'"), composing([]):
+            compose([f"model={name}"])
+
+
 CHOICES = (
     *("masker=square", "masker=none", "+experiment=crm", "+experiment=grbm", "scale=paper"),
     *("model=mfnet", "optimizer=adamw", "+debug=smoke", "hydra.mode=RUN", "+nothing=1"),
@@ -61,7 +97,7 @@ VALUES = (
 )
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_words_are_composed_or_refused_as_hydra_does(seed: int) -> None:
     draw = random.Random(seed)
     words = [*draw.sample(CHOICES, 2), *draw.sample(VALUES, 4)]
@@ -79,7 +115,7 @@ def test_random_words_are_composed_or_refused_as_hydra_does(seed: int) -> None:
             assert found == result(hydra.compose, "config", words), words
 
 
-def test_values_are_set_on_a_copy_of_what_hydra_composed_once() -> None:
+def test_values_are_set_on_copy_of_composed_configuration() -> None:
     composing_module._by_hydra.cache_clear()
     first = compose(("masker=square", "seed=1"))
     first.masker.patch_size = 99

@@ -79,7 +79,7 @@ def test_what_shipped_configurations_name_is_allowed() -> None:
         check_targets({"masker": node("rgbt.data.kp.KP")}, (), "store", "masker")
 
 
-def test_own_code_needs_trust_and_only_its_own_is_run(lab: Path) -> None:
+def test_only_trusted_own_code_is_run(lab: Path) -> None:
     marker = lab / "my_lab.imported"
     with pytest.raises(InputError, match=r"add trust=my_lab\.$"):
         check_targets({"model": node("my_lab.Plain")}, ("my_la", "other"), "store")

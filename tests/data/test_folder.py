@@ -211,7 +211,7 @@ def test_all_in_one_folder(tmp_path: Path) -> None:
     assert check_dataset(dataset).problems == ()
 
 
-def test_two_files_of_one_name_and_a_folder_without_permission(
+def test_files_of_one_name_and_folder_without_permission(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for path in ("a/b_c.png", "a_b/c.png"):

@@ -241,6 +241,14 @@ def test_full_shared_memory_is_reported(dataset: MFNet, monkeypatch: pytest.Monk
         next(batches)
 
 
+def test_more_workers_than_cores_are_no_warning(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    next(trained(dataset, range(1), num_workers=2))
+    assert not [each for each in recwarn if "worker" in str(each.message)]
+
+
 def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     main = os.getpid()
 

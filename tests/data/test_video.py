@@ -131,7 +131,7 @@ def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
 # Sequences.
 
 
-def test_names_that_differ_in_their_last_number_by_one_are_a_sequence() -> None:
+def test_names_with_consecutive_last_numbers_are_a_sequence() -> None:
     names = ["00102D", "00101D", "00103D", "00101N", "00105D", "00106D", "00103D", "other"]
     assert sequences_of_names(names) == (
         *(("00101D", "00102D", "00103D"), ("00105D", "00106D"), ("00101N",), ("other",)),

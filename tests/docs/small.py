@@ -45,12 +45,12 @@ def _groups(word: str) -> str:
     key, _, value = word.partition("=")
     if key not in ("a", "b", "runs") or not Path("runs").is_dir():
         return word
-    from analysis.results import groups_in
+    from analysis.results import finished_runs
+    from rgbt.runs.folder import GROUP
 
     added = {each.lstrip("+") for each in (*SMOKE, ENOUGH)}
-    stored = {
-        " ".join(w for w in each.split(" ") if w not in added): each for each in groups_in("runs")
-    }
+    groups = {run.tags[GROUP] for run in finished_runs() if GROUP in run.tags}
+    stored = {" ".join(w for w in each.split(" ") if w not in added): each for each in groups}
     pieces = [piece.rpartition(":") for piece in value.split(",")]
     return f"{key}=" + ",".join(a + b + stored.get(name, name) for a, b, name in pieces)
 

@@ -38,7 +38,7 @@ def test_every_group_says_what_it_sets(pages: dict[str, str]) -> None:
     assert not [row for row in rows if not row.split("|")[2].strip()]
 
 
-def test_the_page_of_a_group_has_keys_types_defaults_and_meanings(pages: dict[str, str]) -> None:
+def test_page_of_group_has_keys_types_defaults_and_meanings(pages: dict[str, str]) -> None:
     text = pages["reference/configuration/masker.md"]
     (row,) = (line for line in text.splitlines() if line.startswith("| `ratio` |"))
     assert "number from 0 to 1 or null" in row
@@ -98,7 +98,7 @@ def test_every_published_setting_is_shown_with_its_sources(pages: dict[str, str]
     assert cells[4] == "release: `cmx`, `temporal_con_released`; paper: the others"
 
 
-def test_every_experiment_shows_what_keeps_a_user_from_its_number(pages: dict[str, str]) -> None:
+def test_experiments_show_what_keeps_users_from_their_numbers(pages: dict[str, str]) -> None:
     text = pages["reference/recipes.md"]
     for name, sentence in missing().items():
         (line,) = (row for row in text.splitlines() if f"(experiments.md#{name})" in row)

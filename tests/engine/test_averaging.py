@@ -40,7 +40,7 @@ def test_ema_values_follow_decay_and_warm_up() -> None:
     assert found == pytest.approx([0.1 * 1 + 0.9 * 2, 0.15 * 1.9 + 0.85 * 4])
 
 
-def test_last_values_are_the_mean_of_the_last_share_of_steps() -> None:
+def test_last_values_average_the_last_share_of_steps() -> None:
     weights = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0]
     found = values_after(weights, averaging="last", averaged_share=0.5, max_steps=6)
     assert found == pytest.approx([10, 20, 30, 40, (40 + 50) / 2, (40 + 50 + 60) / 3])

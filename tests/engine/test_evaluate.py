@@ -79,7 +79,7 @@ def test_mixed_heads_equal_every_image_alone(
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_scores_that_are_not_finite_are_refused_with_the_image(model: Heads, value: float) -> None:
+def test_scores_not_finite_are_refused_with_the_image(model: Heads, value: float) -> None:
     data = drawn(3)
     data.rgb[1, 0, 2, 3] = value
     with pytest.raises(RunError, match="^image '1': the network's class scores are NaN or inf"):

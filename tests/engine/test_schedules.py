@@ -32,7 +32,7 @@ def rates_in_effect(epochs: int, real: int, counted: int, warmup_epochs: int) ->
     return [*rates, rate]  # the last one is written and never used
 
 
-def test_every_rate_is_that_of_a_loop_that_writes_it_after_the_step() -> None:
+def test_rates_equal_those_of_loop_setting_them_after_steps() -> None:
     schedule = temporal()
     found = [LR * schedule(step, STEPS, 784) for step in range(STEPS + 1)]
     np.testing.assert_allclose(found, rates_in_effect(200, 1568, 1874, 10), rtol=1e-12)

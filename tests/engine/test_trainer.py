@@ -125,7 +125,7 @@ def test_losses_and_values_beside_them_are_logged(tmp_path: Path) -> None:
     assert first["loss"] == first["loss/fit"]
 
 
-def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tmp_path: Path) -> None:
+def test_value_not_finite_is_named_and_stops_the_run(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path, poison=3)
     with pytest.raises(RunError, match=r"step 4: fit is nan"):
         trainer.fit(batches(0), State(seed=0))
@@ -133,7 +133,7 @@ def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("poisoned", "value"), [(2, "nan"), (3, "inf")])
-def test_weights_that_are_not_finite_are_neither_saved_nor_evaluated(
+def test_weights_not_finite_are_neither_saved_nor_evaluated(
     tmp_path: Path, poisoned: int, value: str
 ) -> None:
     trainer, _ = make(tmp_path)
@@ -276,7 +276,7 @@ def test_what_is_not_cleared_is_added(tmp_path: Path, clear: bool) -> None:
     assert model.weight.item() == pytest.approx(2 - 0.25 * 4 - 0.25 * (3 if clear else 7))
 
 
-def test_a_line_has_the_last_values_of_steps_that_alternate(tmp_path: Path) -> None:
+def test_line_has_the_last_values_of_alternating_steps(tmp_path: Path) -> None:
     trainer, log = make(tmp_path, max_steps=4, log_every=2)
     calls = iter(("even", "odd") * 2)
 
@@ -348,9 +348,7 @@ def test_gradients_are_clipped_once_per_phase(
 
 
 @pytest.mark.parametrize("head_rate", ["scheduled", "released"])
-def test_rates_of_backbone_and_head_follow_the_schedule_in_two_sessions(
-    tmp_path: Path, head_rate: Any
-) -> None:
+def test_rates_of_parts_follow_schedule_in_two_sessions(tmp_path: Path, head_rate: Any) -> None:
     """Rates lr (1 - t / T)^0.9, t from 1; or constant, of the head of "SH-Maximum squares loss"."""
     model = nn.ModuleDict({"backbone": nn.Linear(3, 2), "head": nn.Linear(2, 1)})
     model.record = Record(pretrained_parts=("backbone.",))

@@ -13,7 +13,6 @@ from rgbt.evaluation.request import (
     CorruptedDataset,
     choose_corruption,
     choose_corruptions,
-    requested_corruption,
     standard_corruptions,
 )
 from tests.corruptions.recorded import NAMES, Recorded, sample
@@ -115,34 +114,6 @@ def test_file_stem_names_what_is_changed(
     name: str, words: tuple[str, ...], severity: str, file_stem: str
 ) -> None:
     assert choose_corruption(name, words).at(severity).file_stem == file_stem
-
-
-@pytest.mark.parametrize(
-    ("name", "words", "severity", "key"),
-    [
-        ("occludd", [], "0.5", "did you mean 'occluded'"),
-        ("no.yaml", [], "1", "no.yaml"),
-        ("occluded", [], "", "severity"),
-        ("occluded", [], ".nan", "severity"),
-        ("occluded", [], "2", "severity"),
-        ("noise", [], "-1", "severity"),
-        ("frozen", [], "2.5", "severity"),
-        ("delayed", [], ".inf", "severity"),
-        ("removed:rgb", [], "0.5", "severity"),
-        ("removed", [], "1", "corruption.image"),
-        ("frozen:rgb", [], "2", "corruption.image"),
-        ("occluded", ["corruption.blok=1"], "0.5", "corruption.blok.*block"),
-        ("occluded", ["corruption.block=big"], "0.5", "corruption.block"),
-        ("noise", ["corruption.severities=[4,2]"], "3", "corruption.severities"),
-        ("noise", ["corruption.severities=[]"], "3", "corruption.severities"),
-        ("noise", ["corruption.severities=[0,2]"], "3", "corruption.severities"),
-        ("none", ["corruption.block=8"], "", "corruption.block=8 has no effect"),
-        ("none", [], "3", "severity has no effect"),
-    ],
-)
-def test_bad_request_is_refused(name: str, words: list[str], severity: str, key: str) -> None:
-    with pytest.raises(InputError, match=key):
-        requested_corruption(name, severity, words, ())
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import Counted, evaluate, joined
-from rgbt.metrics.details import DEFAULTS, KINDS, OF_SCENES, DetailKind, Details
+from rgbt.metrics.details import DEFAULTS, KINDS, SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.named import value
 from rgbt.processes import collected, rank
 from rgbt.requirements import Record
@@ -74,7 +74,7 @@ def test_details_are_of_the_counted_pixels(data: Path) -> None:
     for kind, counts in result.details.items():
         assert counts.names == tuple(SPLITS["test"])
         assert counts.partition == Details(kind, DEFAULTS[kind]).partition("ring5")
-    for kind in OF_SCENES:  # summed over bins
+    for kind in SCENE_KINDS:  # summed over bins
         counts = result.details[kind]
         bins = counts.counts.reshape(3, 5, -1, 9, 9)
         assert np.array_equal(bins.sum(2), plain.counts.counts)
@@ -111,7 +111,7 @@ def _merged() -> tuple[list[str], dict[str, dict[DetailKind, np.ndarray]]]:
     return list(merged.counts), merged.details
 
 
-def test_processes_together_have_the_details_of_all_images_in_order() -> None:
+def test_processes_together_have_details_of_images_in_order() -> None:
     for names, detailed in run_in_processes(_merged, 2):
         assert names == list(detailed) == list(NAMES)
         for name, kinds in detailed.items():

@@ -173,7 +173,7 @@ def test_classes_are_mapped_after_the_argmax(session: Session, tmp_path: Path) -
     assert found.manifest["label_map"]["groups"]["bump"] == [0, 3]
 
 
-def test_a_killed_command_leaves_no_folder_and_content_is_not_overwritten(
+def test_killed_command_leaves_no_folder_and_overwrites_nothing(
     session: Session, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def dies(*_: object) -> None:

@@ -58,7 +58,7 @@ def batch(label: Any, dtype: torch.dtype = torch.uint8) -> Batch:
     )
 
 
-def test_label_of_the_port_is_the_mean_of_its_pixels() -> None:
+def test_port_label_is_the_mean_of_its_pixels() -> None:
     label = np.repeat(np.array(LABEL, np.uint8), 2, 1)
     found = predictor(counted="image", label_resize="bilinear").counted(batch(label)).label[0]
     # Rows are halved: (1 + 3) / 2, (0 + 8) / 2, 250, and 255 where an ignored pixel takes part.
@@ -130,7 +130,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("name", ["table2", "table3", "table4"])
-def test_released_rows_of_the_thesis_are_predicted_as_its_code_does(name: str) -> None:
+def test_released_thesis_rows_are_predicted_as_its_code_does(name: str) -> None:
     table = load_table(f"multihead/{name}")
     for row in table.runnable_rows:
         if row.released is None:

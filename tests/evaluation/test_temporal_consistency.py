@@ -195,7 +195,7 @@ def test_reliability_of_an_estimated_flow_by_hand() -> None:
     assert _record("a", found)[:3] == ("a", 0.75, 3.0)
 
 
-def test_an_oracle_scores_on_true_frames_what_its_labels_do(tmp_path: Path) -> None:
+def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
     session = on_synth(tmp_path)
     after, oracle = NextFrames(session.dataset), Oracle()
     agree, union = np.zeros(9), np.zeros(9)
@@ -220,7 +220,12 @@ def test_an_oracle_scores_on_true_frames_what_its_labels_do(tmp_path: Path) -> N
     # The second prediction is the label: all three agree where two do.
     assert ca(found.by_region(), "exclude") == pytest.approx(expected, nan_ok=True)
     assert np.nanmean(expected) > 0.6
-    values = consistency_values(consistency_table({"next": found}, "exclude"))
+    table = consistency_table({"next": found}, "exclude")
+    absent = ", ".join(name for name, n in zip(found.classes, union, strict=True) if n == 0)
+    rule = "A class without a pixel is left out of means (absent=exclude)."
+    assert table.notes == (f"{rule} Without one: {absent or 'no class'}.",)
+    assert "counts as 0 (abs" in consistency_table({"next": found}, "released").notes[0]
+    values = consistency_values(table)
     assert values == dict.fromkeys(("TC/next", "CA/next"), pytest.approx(np.nanmean(expected)))
 
 

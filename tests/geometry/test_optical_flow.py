@@ -26,7 +26,7 @@ def frames() -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
 
 
-def test_flow_leads_to_the_first_frame_and_pixels_that_leave_it_are_not_used() -> None:
+def test_flow_leads_to_first_frame_and_drops_pixels_outside() -> None:
     first, second = frames()
     flow = estimate(second, first)
     assert flow.shape == (*HW, 2)

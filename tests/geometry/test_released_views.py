@@ -70,9 +70,7 @@ def test_labels_exactly(recorded: Recorded, warp: Warp) -> None:
     assert moved <= 2
 
 
-def test_logits_up_to_opencv_rounding_points_to_a_32th_pixel(
-    recorded: Recorded, warp: Warp
-) -> None:
+def test_logits_agree_up_to_rounding_of_opencv(recorded: Recorded, warp: Warp) -> None:
     ours = warp.bilinear(recorded.logits().expand(VIEWS, -1, -1, -1))
     for view in range(VIEWS):
         logits, theirs = recorded.sampled(f"{view}.logits", ours[view])

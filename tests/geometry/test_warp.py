@@ -111,7 +111,7 @@ def test_bilinear_is_the_slow_one_and_has_its_gradient(resampling: Resampling) -
     assert torch.autograd.gradcheck(warp.bilinear, (values[:, :2].clone().requires_grad_(),))
 
 
-def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
+def test_once_repeats_the_border_and_twice_fades_it_out() -> None:
     ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
     once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)
     # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
@@ -148,7 +148,7 @@ def test_views_without_a_rectangle_and_from_behind_show_nothing(resampling: Resa
         assert warp.nearest(torch.zeros(1, 48, 64), 255).unique().tolist() == [255]
 
 
-def test_a_resized_warp_is_the_warp_by_the_resized_camera() -> None:
+def test_resized_warp_is_warp_by_the_resized_camera() -> None:
     angles, small = random_angles(3, 2), (240, 320)
     views = homography(angles, RELEASED.matrix(HW), "zyx")
     warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, "once")

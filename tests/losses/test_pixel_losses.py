@@ -117,7 +117,7 @@ def test_feature_distance_and_gradient_by_hand() -> None:
     assert feature_distance(features, initial, cells & False).item() == 0
 
 
-def test_value_is_of_single_precision_and_of_the_cells_of_all_processes(
+def test_value_has_single_precision_and_cells_of_all_processes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """256 - 0.25 is rounded to 256 in bfloat16; the other process has three cells."""

@@ -292,7 +292,7 @@ def test_only_the_last_layer_without_deep_supervision() -> None:
         replace(EDGE, focus="none"),
     ],
 )
-def test_alpha_0_and_focus_none_are_the_plain_loss_bit_for_bit(spatial: SpatialWeight) -> None:
+def test_alpha_0_and_no_focus_equal_the_plain_loss(spatial: SpatialWeight) -> None:
     output, batch = problem_of(2, 4, 2)
     plain = criterion_of()(output, batch, seeded())
     off = criterion_of(spatial=spatial)(output, replace(batch, position=None), seeded())

@@ -101,7 +101,7 @@ def test_con_acc_by_hand() -> None:
     assert con_acc(P, Q, label, "released").item() == pytest.approx(released, abs=1e-6)
 
 
-def test_sigma_is_added_per_pixel_that_counts_or_a_floor() -> None:
+def test_sigma_is_added_per_counted_pixel_or_a_floor() -> None:
     p = torch.full((1, 1, 2, 4), 1e-6, dtype=torch.float64)  # one class, eight pixels, three valid
     valid = torch.tensor([[[True, False, False, True], [False, True, False, False]]])
     # 2 * 3 p^2 over 3 (2 p + sigma).
@@ -210,9 +210,7 @@ def test_values(form: Any, frames: Any) -> None:
 
 
 @pytest.mark.parametrize("second", ["con", "con_acc"])
-def test_means_of_two_by_two_pixels_are_compared_where_so_many_are_given(
-    second: Any, frames: Any
-) -> None:
+def test_full_resolution_is_compared_in_two_by_two_means(second: Any, frames: Any) -> None:
     """Frames of 6 x 7: three rows and four columns, the last one of single pixels."""
     first, other, warped, valid = frames
     warped, valid = warped[..., ::2, ::2], valid[:, ::2, ::2]

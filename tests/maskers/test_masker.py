@@ -78,7 +78,7 @@ def test_individual_masks_have_the_ratio_each_and_overlap(ratio) -> None:
     assert not (thermal[:, None] == rgb).all(-1).any()
 
 
-def test_cells_of_mic_are_independent_and_the_same_in_both_images() -> None:
+def test_cells_of_mic_are_independent_and_hide_both_images() -> None:
     masks = drawn("mic", 4000)
     assert torch.equal(masks.rgb, masks.thermal)
     # 80 cells: the variance of their number is 80 * 0.7 * 0.3 = 16.8, with a standard error of 0.4.
@@ -177,7 +177,7 @@ def test_frequencies_of_the_releases(case) -> None:
         ("crm", {"pattern_probabilities": [0.5, 0.5, 0.5]}, "masker.pattern_probabilities"),
     ],
 )
-def test_a_setting_that_is_wrong_or_without_effect_is_named(variant, changes, key) -> None:
+def test_wrong_setting_or_one_without_effect_is_named(variant, changes, key) -> None:
     with pytest.raises(InputError, match=key):
         configured(variant, **changes)
 

@@ -8,7 +8,7 @@ import torch
 from rgbt.maskers.sketch import GREY, greyed
 
 
-def test_hidden_cells_are_grey_and_the_rest_is_the_image() -> None:
+def test_hidden_cells_are_grey_on_the_image() -> None:
     image = np.full((6, 64, 3), 200, np.uint8)
     hidden = torch.tensor([[True, False, False, True]])
     found = greyed(image, hidden)

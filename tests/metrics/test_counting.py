@@ -104,7 +104,7 @@ def test_pairs_by_hand() -> None:
     ]
 
 
-def test_the_most_classes_fit_and_what_is_not_valid_may_be_none() -> None:
+def test_largest_number_of_classes_fits_without_valid_pixels() -> None:
     last = np.full((2, 3), 254, np.uint8)
     found = pair_counts(last, last, np.array([[254, 255, 0]] * 2), 255, last > 0)
     assert found[254, 254, 254] == found[255, 254, 254] == found[0, 254, 254] == 2
@@ -123,7 +123,7 @@ def square(size: int, low: int, high: int) -> np.ndarray:
     return label
 
 
-def test_boundaries_of_a_square_that_is_predicted_one_pixel_to_the_right() -> None:
+def test_boundaries_of_square_predicted_one_pixel_to_right() -> None:
     # 7 x 7, d = 1. The label is the square of rows and columns 2..4, the prediction columns 3..5.
     label, prediction = square(7, 2, 5), np.roll(square(7, 2, 5), 1, axis=1)
     found = counted(BORDER, label, prediction)

@@ -11,7 +11,15 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import DEFAULTS, Details, details_of, regions_of, requested
-from rgbt.metrics.named import CHANGES, OF_PAIRS, details_of_metric, images_of, parse, value, values
+from rgbt.metrics.named import (
+    CHANGES,
+    PAIR_SCORES,
+    details_of_metric,
+    images_of,
+    parse,
+    value,
+    values,
+)
 from rgbt.metrics.names import in_percent, shown
 from rgbt.metrics.score_grid import headlines, score_grid
 from tests.sweeps.tabled import DAY, counts_of
@@ -156,7 +164,7 @@ def test_kind_of_details_that_a_metric_needs() -> None:
 )
 def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     requested = parse(metric)
-    counts = pairs_of() if requested.score in {*OF_PAIRS, *CHANGES} else counts_of()
+    counts = pairs_of() if requested.score in {*PAIR_SCORES, *CHANGES} else counts_of()
     by_region = images_of(requested, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
     found = values(requested, many, counts, "released")

@@ -27,7 +27,7 @@ def drawn(module: nn.Module) -> Any:
 
 
 @BOTH
-def test_rectified_maps_go_on_and_fused_maps_to_the_decoder(name: str) -> None:
+def test_rectified_maps_continue_and_fused_maps_are_decoded(name: str) -> None:
     net = nano(name).eval()
     rectified, fused, fed = [], [], []
     for rectify, fuse in zip(net.backbone.FRMs, net.backbone.FFMs, strict=True):

@@ -117,7 +117,7 @@ def test_factors_are_zero_or_the_inverse_of_the_probability() -> None:
     assert factors[1].mean().item() == pytest.approx(1.0, abs=0.02)
 
 
-def test_whole_channels_are_dropped_before_the_first_block_and_after_every_one() -> None:
+def test_channels_are_dropped_before_and_after_every_block() -> None:
     x, seen = torch.ones(4, 500, 2, 2), []
     blocks = [nn.Identity(), nn.Identity()]
     for block in blocks:
@@ -286,7 +286,7 @@ def test_statistics_move_where_norms_are_not_trained() -> None:
     assert not torch.equal(before, net.backbone.bn1.running_mean)
 
 
-def test_thermal_stem_of_rtfnet_starts_as_the_mean_of_the_rgb_stem_or_anew() -> None:
+def test_thermal_stem_of_rtfnet_starts_as_mean_or_anew() -> None:
     mean, anew = nano("rtfnet"), nano("rtfnet", thermal_stem="xavier")
     weight = mean.encoder_rgb_conv1.weight
     expected = (weight[:, 0] + weight[:, 1] + weight[:, 2]) / 3

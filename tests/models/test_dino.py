@@ -195,7 +195,7 @@ def test_positions_are_resized_in_both_published_forms(hw: tuple[int, int], form
 
 
 @torch.no_grad()
-def test_hidden_patches_do_not_count_and_show_the_mask_token() -> None:
+def test_hidden_patches_show_mask_token_and_do_not_count() -> None:
     net = encoder()
     hidden = torch.zeros(1, 5, 5, dtype=torch.bool)
     hidden[0, 1, 3] = True
@@ -361,7 +361,7 @@ def test_updates_change_nothing_at_first_and_then_their_modality(per_modality: b
 
 
 @torch.no_grad()
-def test_the_thermal_vector_is_0_at_first_and_reaches_thermal_alone() -> None:
+def test_thermal_vector_starts_at_0_and_reaches_thermal_alone() -> None:
     net, pair = nano().eval(), images(1)
     assert not net.backbone.thermal_embedding.any()
     before = [net(*pair, views=(view,)).logits for view in ("rgb", "thermal")]

@@ -96,7 +96,7 @@ def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: 
         torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=tolerance)
 
 
-def test_the_finest_features_of_predictions_without_masks_need_no_gradient() -> None:
+def test_finest_features_need_no_gradient_without_masks() -> None:
     net = nano().train()
     aux = net(*images(2), views=VIEWS, num_masks=1).aux
     aux["class_logits"][-1, 1:].sum().backward()
@@ -126,7 +126,7 @@ def test_mask_token_replaces_exactly_the_hidden_tokens() -> None:
         assert torch.equal(seen[name], expected)
 
 
-def test_shared_mask_token_is_one_parameter_with_the_gradient_of_both() -> None:
+def test_shared_mask_token_has_the_gradient_of_both_uses() -> None:
     apart, shared = nano(), nano(mask_token="shared")
     assert count(apart) - count(shared) == 8  # embed_dim values
     branches = (shared.backbone.RGB_branch, shared.backbone.THR_branch)
@@ -152,7 +152,7 @@ def test_calls_that_do_not_fit_raise() -> None:
 
 
 @pytest.mark.parametrize("fp32", [True, False])
-def test_autocast_keeps_the_pixel_decoder_in_single_precision_on_request(fp32: bool) -> None:
+def test_autocast_keeps_pixel_decoder_in_single_precision_on_request(fp32: bool) -> None:
     net = nano(pixel_decoder_fp32=fp32).train()
     seen: list[torch.dtype] = []
     net.sem_seg_head["pixel_decoder"].layer_1.register_forward_hook(

@@ -17,7 +17,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch_generator(seed, "test", device=device())
 
 
-def test_points_lie_inside_and_do_not_depend_on_how_many_sets_are_requested() -> None:
+def test_points_lie_inside_whatever_the_number_of_sets() -> None:
     together = Points(generator(), device=device()).loss(3, 2, 101)
     one_by_one = Points(generator(), device=device())
     apart = torch.cat([one_by_one.loss(1, 2, 101) for _ in range(3)])

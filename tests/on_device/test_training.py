@@ -39,7 +39,7 @@ def test_step_is_that_of_the_cpu(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_stopped_run_resumes_with_the_losses_of_a_straight_one(
+def test_stopped_run_resumes_with_losses_of_straight_run(
     call: Call, data: Path, tmp_path: Path, precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = (*ON, "+experiment=crm", f"trainer.precision={precision}", *short(4))

@@ -27,7 +27,7 @@ def git(folder: Path, *arguments: str) -> None:
     subprocess.run(["git", "-C", str(folder), *who, *arguments], check=True, capture_output=True)
 
 
-def test_provenance_can_be_written_as_json_and_says_where_it_ran() -> None:
+def test_provenance_is_json_and_says_where_it_ran() -> None:
     entry = provenance()
     assert json.loads(json.dumps(entry)) == entry
     assert (entry["host"], entry["python"]) == (platform.node(), platform.python_version())
@@ -86,7 +86,7 @@ KEPT = (
 )
 
 
-def test_what_is_no_password_is_kept_and_a_quoted_one_hidden() -> None:
+def test_only_passwords_are_hidden_also_quoted_ones() -> None:
     assert [without_passwords(text) for text in KEPT] == [*KEPT]
     assert command_line(["python", "password='a b'", "-m"]) == "python 'password=***' -m"
 
@@ -132,7 +132,7 @@ def test_other_code_counts_for_processes_that_left_something(
     assert (other_code(tmp_path) is not None) == is_other
 
 
-def test_package_digest_is_of_code_and_tables_wherever_they_lie(tmp_path: Path) -> None:
+def test_package_digest_covers_code_and_tables_wherever_they_lie(tmp_path: Path) -> None:
     def digest(place: str, **files: str) -> str:
         for name, text in {"a.py": "a = 1\n", "angles.csv": "1,2\n", **files}.items():
             (tmp_path / place).mkdir(exist_ok=True)

@@ -130,7 +130,7 @@ with holding(Path(sys.argv[1])):
 """
 
 
-def test_lock_is_freed_when_its_process_is_killed_though_a_forked_child_lives_on(
+def test_lock_of_killed_process_is_freed_despite_forked_child(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "lock"
@@ -141,7 +141,7 @@ def test_lock_is_freed_when_its_process_is_killed_though_a_forked_child_lives_on
         assert is_held(path)
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while is_held(path) and time.monotonic() < deadline:
             time.sleep(0.05)  # the child may not have reached its first instruction yet
         is_free = not is_held(path)
@@ -246,7 +246,7 @@ def finished(tmp_path: Path) -> RunFolder:
     return folder
 
 
-def test_set_aside_keeps_every_finished_run_outside_of_its_group(tmp_path: Path) -> None:
+def test_set_aside_keeps_finished_runs_outside_their_group(tmp_path: Path) -> None:
     kept = [set_aside(finished(tmp_path)), set_aside(finished(tmp_path))]
     paths = [each.path for each in kept if each]
     assert paths == [tmp_path / "replaced" / "abc-1", tmp_path / "replaced" / "abc-2"]

@@ -45,7 +45,7 @@ OTHER = (
 
 
 @pytest.mark.parametrize("typed", SAME)
-def test_key_is_the_same_for_what_does_not_change_the_result(typed: str) -> None:
+def test_key_ignores_what_does_not_change_the_result(typed: str) -> None:
     assert key_of("grbm", *typed.split()) == key_of("grbm")
 
 
@@ -151,7 +151,7 @@ def test_labels_folder_names_what_is_predicted(typed: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", ["grbm", "temporal_con", "multi_head_modified_night_init"])
-def test_run_with_another_seed_is_the_run_composed_with_it(experiment: str) -> None:
+def test_run_with_another_seed_equals_composing_that_seed(experiment: str) -> None:
     made, direct = spec_of(experiment, "seed=0").with_seed(3), spec_of(experiment, "seed=3")
     assert (made.key, made.plain, made.overrides) == (direct.key, direct.plain, direct.overrides)
     assert [each.key for each in made.upstream] == [each.key for each in direct.upstream]

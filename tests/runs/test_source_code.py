@@ -88,7 +88,7 @@ def test_user_code_changes_with_what_runs(write: Write, file: str, text: str, co
     assert user_code([TARGET]) == before
 
 
-def test_user_code_of_an_installed_distribution_is_its_version_and_ours_none() -> None:
+def test_installed_user_code_is_its_version_and_ours_none() -> None:
     import scipy
 
     assert user_code(["scipy.optimize.minimize"]) == (("scipy", scipy.__version__),)

@@ -73,7 +73,7 @@ def test_the_step_in_progress_is_finished_and_saved(
     assert losses[0] == losses[1]
 
 
-def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> None:
+def test_evaluation_is_left_at_once_and_repeated_on_resuming(tmp_path: Path) -> None:
     waited: list[int] = []
 
     def stopped(step: int) -> float:
@@ -109,7 +109,7 @@ def test_signal_that_comes_while_processes_agree_is_not_lost(
         trainer.fit(batches(0), State(seed=7))
 
 
-def test_a_second_ctrl_c_stops_in_the_middle_of_a_step(tmp_path: Path) -> None:
+def test_second_ctrl_c_stops_in_the_middle_of_step(tmp_path: Path) -> None:
     trainer, _ = train(tmp_path)
     with pytest.raises(KeyboardInterrupt) as interrupt:
         trainer.fit(sending(signal.SIGINT, 1, times=2), State(seed=7))
@@ -166,7 +166,7 @@ def started(loader: DataLoader[int]) -> Iterator[int]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
+def test_workers_leave_group_signals_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
         range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
@@ -185,7 +185,7 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     assert worker.exitcode == 0, "the main process ends them"
 
 
-def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:
+def test_library_error_after_a_signal_is_its_consequence(call: Call) -> None:
     """As where a ``finally`` needs what was not complete yet."""
 
     def main(options: NoOptions, overrides: list[str]) -> int:

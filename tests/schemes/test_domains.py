@@ -100,7 +100,7 @@ def test_maximum_squares_step_reads_no_label_of_the_target() -> None:
     assert phase.parts["target/max_squares"].item() == pytest.approx(squares.item(), rel=1e-5)
 
 
-def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below() -> None:
+def test_guidance_trains_only_auxiliary_head_and_layers_below() -> None:
     """Its label is no function of the scores: the head that gives it gets no gradient."""
     model, pair = network(False, auxiliary=True), pair_at()
     (phase,) = phases_of(unlabelled(model, guidance_weight=0.25, guidance_threshold=0.4), pair)
@@ -229,9 +229,7 @@ def test_parts_of_both_phases_by_their_formulas(heads: bool, changes: dict[str, 
 
 
 @BY_CASE
-def test_phases_of_one_step_do_not_touch_each_others_networks(
-    heads: bool, changes: dict[str, Any]
-) -> None:
+def test_phases_of_step_do_not_share_trained_networks(heads: bool, changes: dict[str, Any]) -> None:
     """The segmentation leaves no gradient in the discriminator, nor the other way round."""
     model = network(heads)
     scheme = scheme_of(model, heads, **changes)
@@ -345,7 +343,7 @@ SOURCE = ("source network", "source loss")
         (True, HEATNET, ["source network", "target network"]),  # the discriminator's step
     ],
 )
-def test_every_pass_of_a_step_asks_for_a_generator_of_its_own(
+def test_every_pass_of_a_step_has_its_own_generator(
     heads: bool, changes: dict[str, Any], expected: list[str]
 ) -> None:
     requested: list[str] = []
@@ -361,7 +359,7 @@ def test_every_pass_of_a_step_asks_for_a_generator_of_its_own(
 # ---- HeatNet's one RMSprop for two networks ------------------------------------------------------
 
 
-def test_idle_optimizers_decay_their_mean_of_squares_and_move_nothing(tmp_path: Path) -> None:
+def test_idle_optimizers_decay_mean_squares_and_move_nothing(tmp_path: Path) -> None:
     """Of three alternating steps, the network's is the second one, and idle in the third."""
     found = {}
     for idle_steps in ("none", "released"):

@@ -56,7 +56,7 @@ def test_half_of_the_values_of_the_batch_are_pasted(values: list[int], pasted: i
     assert len(values) == 1 or not all(torch.equal(masks[0], each) for each in masks)
 
 
-def test_both_images_label_and_weight_are_pasted_with_one_mask() -> None:
+def test_images_label_and_weight_are_pasted_with_one_mask() -> None:
     source, target = pair_of(0.01, label=3), pair_of(0.02, label=5)
     pasted = torch.tensor([[[True, False, False], [False, True, False]]])
     found = mixed(source, target, pasted)
@@ -249,7 +249,7 @@ def test_parts_of_a_step_by_their_definition(mixing: str) -> None:
     torch.testing.assert_close(phase.logged[CONFIDENCE], confidence)
 
 
-def test_masked_images_of_both_domains_have_half_of_the_weight_each() -> None:
+def test_masked_images_of_each_domain_have_half_the_weight() -> None:
     model, data = network(False), batches()
     phase = phase_of(scheme_of(model, masked_images="both", jitter=1.0), data)
     label, share = teacher_labels(model, data.target)
@@ -275,7 +275,7 @@ def test_masks_of_source_and_target_are_drawn_apart() -> None:
     assert not torch.equal(source, target)
 
 
-def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None:
+def test_only_mix_and_masked_target_are_augmented() -> None:
     model, data = network(False), batches()
     plain = phase_of(scheme_of(model), data)
     strong = phase_of(scheme_of(model, jitter=1.0), data)
@@ -285,7 +285,7 @@ def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None
     assert plain.logged[CONFIDENCE] == strong.logged[CONFIDENCE]
 
 
-def test_feature_distance_is_that_to_the_start_on_things_of_the_source() -> None:
+def test_feature_distance_is_measured_on_things_of_the_source() -> None:
     model, data = network(False), batches()
     scheme = scheme_of(model, **DISTANCE)
     start = model.backbone.weight.detach().clone()
@@ -328,7 +328,7 @@ def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
 
 
-def test_labels_are_those_of_the_average_of_the_steps_before() -> None:
+def test_labels_come_from_the_average_of_earlier_steps() -> None:
     """In step 1 the teacher is the mean of two networks, and the student another one."""
     model = network(False)
     scheme = scheme_of(model, masked_weight=0.0)

@@ -19,9 +19,9 @@ def alone() -> dict[str, Values]:
 
 
 @cache
-def together(num_processes: int) -> list[dict[str, Values]]:
+def together() -> list[dict[str, Values]]:
     """By rank. Processes are started once for all tests."""
-    return run_in_processes(everything, num_processes)
+    return run_in_processes(everything, 2)
 
 
 def everything() -> dict[str, Values]:
@@ -45,11 +45,10 @@ def assert_same(found: Values, expected: Values) -> None:
         assert not apart.numel() or apart.max() <= TOLERANCE * largest[kind(name)], name
 
 
-@pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
-def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> None:
+def test_processes_compute_the_step_of_one(name: str) -> None:
     expected = alone()[name]
-    for found in together(num_processes):
+    for found in together():
         assert_same(found[name], expected)
     # Neither is nothing.
     losses = [value for key, value in expected.items() if " loss " in key]

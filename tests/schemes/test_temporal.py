@@ -202,9 +202,7 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
 
 @pytest.mark.parametrize("hw", [HW, (48, 61)])
 @pytest.mark.parametrize("warps", ["probabilities", "logits"])
-def test_half_resolution_warps_the_scores_averaged_over_two_by_two_pixels(
-    warps: Any, hw: tuple[int, int]
-) -> None:
+def test_half_resolution_warps_means_of_two_by_two_scores(warps: Any, hw: tuple[int, int]) -> None:
     camera = Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=hw[0], width=hw[1])
     turned = view(mode="rotation", camera=camera)
     full, half = (

@@ -32,7 +32,7 @@ from sweeps.worker.storage import STALE_S, TrialStore, open_storage, open_study
 from sweeps.worker.trial_sources import SamplerSource
 
 DATASET = "fingerprint-of-the-data"
-DEADLINE_S = 60.0
+DEADLINE_S = 180.0
 """Generous: the machine may be busy. Nothing waits for it but a test that fails."""
 
 

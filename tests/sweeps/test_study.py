@@ -150,7 +150,11 @@ def test_importances_missing_have_a_reason() -> None:
     assert found[1] == (None, "no parameter, or no objective, took two values.")
 
 
-def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> None:
+@pytest.mark.parametrize("installed", [None, "optuna_dashboard"])
+def test_study_of_search_is_shown_and_written(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: str | None
+) -> None:
+    monkeypatch.setattr(study, "find_spec", lambda _: installed)
     url = f"sqlite:///{tmp_path}/studies.db"
     made = new_study("val/mIoU", study_name="search/grbm", storage=url)
     made.set_user_attr(attributes.COMMAND, "python -m rgbt.run -m storage=postgresql://u:pw@h/db")
@@ -164,7 +168,7 @@ def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> Non
     assert out.index("50.75") < out.index("50.50") < out.index("50.25")
     assert "[Errno 28] disk full" in out
     assert "Importances: they need 10 complete trials, and there are 3." in out
-    assert f"optuna-dashboard {url}" in out
+    assert (f"optuna-dashboard {url}" in out) == bool(installed)
     assert {path.name for path in folder.iterdir()} == {"study.md", "trials.csv"}
     text = (folder / "study.md").read_text()
     assert "postgresql://u:***@h/db" in text

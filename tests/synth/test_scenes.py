@@ -231,7 +231,7 @@ def test_label_and_depth_of_a_box_follow_the_camera() -> None:
     assert sorted(seen) == [0, (label == CAR).sum()]
 
 
-def test_normals_are_those_of_the_facets_and_point_at_the_camera() -> None:
+def test_normals_of_facets_point_at_the_camera() -> None:
     road, camera = draw_road(0, 3, FACTORS), camera_of(FACTORS)
     facets = facets_of(ground_quads(road), place_objects(0, 3, road, FACTORS))
     normals = draw(facets, camera).normals[1:].astype(float)

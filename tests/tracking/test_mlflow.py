@@ -131,7 +131,7 @@ POINTS = {
 }
 
 
-def test_a_killed_run_continues_in_the_same_mlflow_run_without_duplicates(
+def test_killed_run_continues_its_mlflow_run_without_duplicates(
     runs_dir: Path, finished: RunFolder
 ) -> None:
     run = run_id(finished)
@@ -155,7 +155,7 @@ def test_a_run_sent_again_leaves_no_duplicate(runs_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, '{"uri": 3'])
-def test_run_without_noted_id_is_identified_by_its_key_and_start(
+def test_run_without_noted_id_is_found_by_its_key(
     runs_dir: Path, content: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its process was killed before it noted the id, or the note is damaged."""
@@ -196,7 +196,7 @@ def test_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None
     assert experiment.artifact_location == (runs_dir / "mlartifacts").as_uri()
 
 
-def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Path) -> None:
+def test_replaced_run_and_its_successor_are_two_mlflow_runs(runs_dir: Path) -> None:
     folder, tracker = RunFolder(runs_dir / "again"), tracking(runs_dir)
     for _ in range(2):
         kept = set_aside(folder)
@@ -229,7 +229,7 @@ def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
     assert points(store, second, "train/loss") == [(5, 3.0)]
 
 
-def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
+def test_dead_tracker_warns_once_and_sync_fills_it_later(
     runs_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = RunFolder(runs_dir / "dead")
@@ -247,7 +247,7 @@ def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
     assert points(client(runs_dir), run_id(folder), "train/loss") == [(5, 5.0)]
 
 
-def test_sync_of_all_folders_sends_those_behind_a_damaged_one(
+def test_sync_continues_behind_a_damaged_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     damaged = {"a": "result.json", "b": "run.json", "c": "metrics.jsonl"}

@@ -183,7 +183,7 @@ def test_pipeline_predicts_and_validates_for_unfinished_labels(
     assert run("multi_head_night_stage1").validated == []
 
 
-def test_run_reports_ignored_pretrained_and_takes_tags_of_the_environment(
+def test_run_reports_ignored_pretrained_and_takes_environment_tags(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs: list[tuple[str, Mapping[str, str]]] = []
@@ -233,7 +233,7 @@ def test_pipeline_run_finished_by_another_process_is_used(run: Pipeline) -> None
     assert run("sh_adversarial", notes=Notes(finished_by_another=True)).trained == []
 
 
-def test_a_run_that_is_stopped_while_its_tracking_begins_is_closed(
+def test_run_stopped_while_its_tracking_begins_is_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Slow(Tracking):

@@ -91,7 +91,7 @@ def test_draws_have_their_ranges_and_odds() -> None:
     assert found == {tuple(shift_hue(red, by)[0, 0].tolist()) for by in (-2, -1, 0, 1, 2)}
 
 
-def test_pixels_do_not_depend_on_their_place_in_a_row() -> None:
+def test_pixels_do_not_depend_on_place_in_row() -> None:
     """OpenCV rounds the last pixels of a row of HSV in another way than those before them."""
     pixels = np.random.default_rng(5).integers(0, 256, (1, 131, 3), dtype=np.uint8)
     whole = shift_hue(pixels, 7)

@@ -124,7 +124,7 @@ def test_mixed_labels_are_brightness_but_for_ignored_ones() -> None:
     assert mixed(label, (1, 3)).tolist() == [[255, 3, 3]]
 
 
-def test_examples_do_not_share_memory_with_views_of_the_file() -> None:
+def test_examples_share_no_memory_with_the_file() -> None:
     maps = replace(Maps.of(noise()), name="other")
     cut = maps.crop((slice(3, 13), slice(4, 16))).flip(True).example(False)
     assert cut.rgb.flags.c_contiguous

@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from torch.nn import functional as F
 
 from rgbt.config.component import build, constructor
-from rgbt.config.compose import compose, conf_dir
+from rgbt.config.compose import compose, load_choice
 from rgbt.transforms.fixed_size import recoloured
 from rgbt.types import IGNORE, Example, Sample
 from tests.transforms.recipes import SIZES, noise
@@ -350,7 +349,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_configuration_has_every_setting_and_published_numbers(name: str) -> None:
-    node = yaml.safe_load((conf_dir() / "transform" / f"{name}.yaml").read_text())
+    node = load_choice(f"transform/{name}")
     if "defaults" not in node:
         parameters = inspect.signature(constructor(node["_target_"], "transform")).parameters
         assert set(node) == {"_target_", *parameters}

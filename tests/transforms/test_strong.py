@@ -74,7 +74,7 @@ def test_probabilities() -> None:
     assert shares == pytest.approx({"jitter": 80, "blur": 50}, abs=16)
 
 
-def test_thermal_has_draws_of_its_own_and_stays_one_channel() -> None:
+def test_thermal_has_its_own_draws_and_one_channel() -> None:
     """Brightness and contrast are linear before the clip: thermal = a x + b for every image."""
     rgb, thermal = images()
     found = augmentation(1.0, 0.0)(rgb, 0.3 + 0.2 * thermal, torch_generator(0, "a"))[1]

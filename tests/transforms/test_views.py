@@ -138,7 +138,7 @@ def test_confidences_move_with_their_labels(
         assert torch.equal(found.label[inside], batch.label[0, rows, columns][inside[0]])
 
 
-def test_the_centre_moves_to_the_nearest_pixel_of_the_view() -> None:
+def test_centre_moves_to_the_nearest_pixel_of_view() -> None:
     """The middle half is enlarged twofold: row 30 to (30 - 23.5) 2 - 0.5, less 0.2 of the shift."""
     whole, middle = (-0.5, -0.5, 127.5, 95.5), (31.5, 23.5, 95.5, 71.5)
     for x, y, edges, point, expected in (
@@ -155,7 +155,7 @@ def test_the_centre_moves_to_the_nearest_pixel_of_the_view() -> None:
 
 
 @pytest.mark.parametrize("make", [paper, released])
-def test_released_images_are_whole_bytes_and_those_of_the_paper_are_not(make: Any) -> None:
+def test_only_released_images_are_whole_bytes(make: Any) -> None:
     view = make()
     found = view.batch(scene(), view.warp(angles((4, 7, 1)), HW))
     for image in (255 * found.rgb, 255 * found.thermal):
@@ -204,7 +204,7 @@ def sets(*names: str, view: VirtualView | None = None) -> ViewSets:
     return ViewSets(view=view or released(), sets=names, splits=("test",))
 
 
-def test_the_kth_image_has_the_kth_triple_and_long_lists_begin_again() -> None:
+def test_images_take_triples_in_order_and_again() -> None:
     views, triples = sets("released_1", "released_3"), read_angles("released_3")
     assert torch.equal(views.angles(1, [5, 0, 392, 393, 398]), triples[[5, 0, 392, 0, 5]])
     assert views.angles(0, [0]).tolist() == [[4, 7, 1]]
@@ -261,7 +261,7 @@ def test_unknown_sets_and_sets_without_a_split_are_refused(tmp_path: Path) -> No
     assert ViewSets(view=released(), sets=(), splits=()).sets == ()
 
 
-def test_views_that_paint_the_background_require_class_0_to_be_that() -> None:
+def test_views_painting_background_require_it_as_class_0() -> None:
     (required,) = sets("released_1").record.requires
     assert (required.node, required.setting) == ("dataset", "consistency.view.outside=background")
     assert required.is_met_by(Record(first_class="background"))

@@ -137,7 +137,7 @@ class MlpDecoder(nn.Module):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
 
     def train(self, mode: bool = True) -> MlpDecoder:
-        """Also chooses the eps of the normalisation, of any class that normalises a batch."""
+        """Set the mode, and the eps of all layers that normalise a batch."""
         self.linear_fuse[1].eps = self.norm_eps[0 if mode else 1]  # type: ignore[assignment]
         return super().train(mode)
 
@@ -210,7 +210,7 @@ class CMX(CmxNetwork):
     huaaaliu/RGBX_Semantic_Segmentation; lab-sun/Temporal-Consistent-RGBT-Segmentation (the same
     network, other inputs, and an unused layer `voting`).
 
-    The arguments are the keys of ``conf/model/cmx_b2.yaml``. The release trains with a
+    The arguments are the keys of ``conf/model/cmx.yaml``. The release trains with a
     `decoder_norm_eps` of 1e-3, and evaluates with 1e-5, without the set-up of weights.
     """
 

@@ -133,7 +133,7 @@ class ChannelWeights(nn.Module):
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         """Two (N, H, W, C) -> (2, N, 1, 1, C) in (0, 1): weights on x1, weights on x2."""
         maps = [x.flatten(1, 2) for x in (x1, x2)]
-        # Of equal maxima one has the gradient, as in the release: hidden pixels make such ties.
+        # One of equal maxima has the gradient, as in the release: hidden pixels make such ties.
         pooled = [x.mean(1) for x in maps] + [x.max(1).values for x in maps]
         weights = self.mlp(torch.cat(pooled, 1)).sigmoid()
         return weights.view(x1.shape[0], 2, 1, 1, -1).transpose(0, 1)

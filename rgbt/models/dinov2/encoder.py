@@ -25,8 +25,8 @@ MlpForm = Literal["gelu", "swiglu"]
 Part = Literal["q", "k", "v"]
 PARTS: tuple[Part, ...] = ("q", "k", "v")  # in the order of the rows of a joint projection
 
+# Cosine and sine, (T, D) each, D channels of a head.
 Rotation = tuple[Tensor, Tensor]
-"""Cosine and sine, (T, D) each, D channels of a head."""
 
 
 class LoraProjection(nn.Module):

@@ -128,7 +128,7 @@ class DinoMask2Former(MaskNetwork):
     ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.
     With the weights of a published file, the patch tokens of an RGB image are those of its network.
 
-    The arguments are the keys of ``conf/model/dinov2_vits14.yaml`` and ``dinov3_vits16.yaml``. With
+    The arguments are the keys of ``conf/model/dinov2.yaml`` and ``dinov3.yaml``. With
     `thermal_embedding`, a frozen encoder keeps the activations of thermal images for its gradient.
     """
 

@@ -63,7 +63,7 @@ class Untrained:
 
 
 def allow_cpu() -> None:
-    """Without a GPU, ``.cuda()`` returns its tensor or module unchanged from now on."""
+    """Let ``.cuda()`` return its tensor or module unchanged on a machine without a GPU."""
     if not torch.cuda.is_available():
         for kind in (torch.Tensor, nn.Module):
             setattr(kind, "cuda", lambda self, *_, **__: self)  # noqa: B010 - not a type's method

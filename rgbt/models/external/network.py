@@ -32,6 +32,7 @@ OWN = "network."  # before every name of the author's network in `state_dict`
 
 Feed = Literal["stacked", "pair", "pair_and_edges", "list", "dicts", "thermal"]
 
+# Form -> arguments of the call: of normalised images and, for one of them, of an edge map.
 FEEDS: Mapping[Feed, Callable[..., tuple[Any, ...]]] = {
     "stacked": lambda rgb, thermal: (torch.cat([rgb, thermal], 1),),
     "pair": lambda rgb, thermal: (rgb, thermal),
@@ -40,11 +41,10 @@ FEEDS: Mapping[Feed, Callable[..., tuple[Any, ...]]] = {
     "dicts": lambda rgb, thermal: ([{"image": each} for each in torch.cat([rgb, thermal], 1)],),
     "thermal": lambda _, thermal: (thermal,),
 }
-"""Form -> arguments of the call: of normalised images and, for one of them, of an edge map."""
 
 Index = Annotated[int, Interval(ge=-1000, le=1000)]
+# Indices, keys and attributes that lead to scores; "*" stacks what follows of every element.
 ScorePath = Annotated[tuple[Index | Text, ...], Len(0, 16)]
-"""Indices, keys and attributes that lead to scores; "*" stacks what follows of every element."""
 
 ScorePaths = Annotated[tuple[ScorePath, ...], Len(1, 16)]
 
@@ -178,7 +178,7 @@ def _resized(maps: Tensor, hw: tuple[int, ...]) -> Tensor:
 
 @contextmanager
 def seeded(seed: int, device: torch.device) -> Iterator[None]:
-    """Within it, the global generators begin at `seed`; afterwards they are as before.
+    """A context in which the global generators begin at `seed`; then they are as before.
 
     Those of Python, NumPy, torch on the CPU and torch on `device`; `seed` from 0 to 2^32 - 1.
     """

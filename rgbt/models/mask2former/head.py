@@ -20,13 +20,13 @@ GROUPS = 32  # of every group normalisation (Mask2Former release)
 NUM_LEVELS = 3
 POINTS = 4  # sampled per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)
 
+# Rows and columns of every level.
 Levels = tuple[tuple[int, int], ...]
-"""Rows and columns of every level."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeadShape:
-    """Sizes of both decoders; keys of ``conf/model/mask2former_swin_t.yaml``."""
+    """Sizes of both decoders; keys of ``conf/model/mask2former.yaml``."""
 
     num_classes: int
     hidden_dim: int

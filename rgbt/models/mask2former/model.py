@@ -68,7 +68,7 @@ class Mask2Former(MaskNetwork):
     Source: CRM, Sec. III; SpatialSeg, Sec. III-A.   Released: UkcheolShin/CRM_RGBTSeg,
     lab-sun/SpatialSeg (the same network).
 
-    The arguments are the keys of ``conf/model/mask2former_swin_t.yaml``.
+    The arguments are the keys of ``conf/model/mask2former.yaml``.
     """
 
     record = replace(

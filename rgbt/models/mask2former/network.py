@@ -40,8 +40,8 @@ RECORD = Record(
 )  # of every such network, without its backbone
 
 Widths = tuple[int, int, int, int]
+# (N, C_s, H/s, W/s), s = 4, 8, 16, 32.
 Maps = list[Tensor]
-"""(N, C_s, H/s, W/s), s = 4, 8, 16, 32."""
 
 
 class Request(NamedTuple):

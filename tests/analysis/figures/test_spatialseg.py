@@ -88,7 +88,7 @@ def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absen
     np.testing.assert_allclose([heat.centre, heat.edge, heat.image], wanted)
 
 
-def test_occupancy_is_the_share_of_labels_that_are_not_background() -> None:
+def test_occupancy_is_the_share_of_labels_beside_background() -> None:
     labels = np.zeros((4, 6, 8), np.uint8)
     inner = RINGS.map((6, 8)) == 0
     labels[0][inner] = 1
@@ -122,12 +122,6 @@ def test_changes_from_the_first_region_by_hand() -> None:
     np.testing.assert_allclose(frame["value"], [0, 37.5, 0, 12.5, 0, -30])
 
 
-def test_absent_classes_count_by_the_option() -> None:
-    lonely = {"a": counts_of(np.array([[[4, 0], [0, 0]], [[4, 0], [0, 4]]]))}
-    for absent, score in (("released", 50), ("exclude", 100)):
-        assert trend("ring", np.ones(2), lonely, absent)["score"][0] == score  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("partition", ["vertical2", "ring3", "ring21"])
 def test_counts_of_another_partition_are_refused(partition: str) -> None:
     other = counts_of(TWO, partition=partition)
@@ -156,13 +150,7 @@ def test_shares_of_the_largest_region_and_miou_by_hand(tmp_path: Path) -> None:
     assert {"car", "color cone", "mIoU (CRM-B)"} <= set(found)
 
 
-def test_class_that_occurs_nowhere_has_no_share_and_a_remark(tmp_path: Path) -> None:
-    frame = class_regions(statistics(np.minimum(two_images(), 1), HALVES, None))
-    assert frame[frame["series"] == "color_cone"]["value"].isna().all()
-    assert "color cone (none)" in texts(draw_classes(frame, "region"), tmp_path)
-
-
-def test_the_miou_is_of_the_same_part_as_the_shares() -> None:
+def test_miou_covers_the_same_part_as_the_shares() -> None:
     matrices = np.array([[TWO[0]] * 2, [TWO[1]] * 2])
     counts = counts_of(matrices, partition="vertical2")
     stats = statistics(two_images(), HALVES, np.array([False, True]))
@@ -214,11 +202,3 @@ def test_far_modalities_get_a_logarithmic_axis(tmp_path: Path) -> None:
     assert figure.axes[0].get_yscale() == "log"
     found = texts(figure, tmp_path)
     assert {"RGB, all", "thermal, night", "SNR", "(all 40, day 20, night 20 images)"} <= set(found)
-
-
-def test_a_single_image_has_no_interval_and_is_drawn(tmp_path: Path) -> None:
-    single = statistics(np.zeros((1, 4, 6), np.uint8), strips(3), None)
-    sample = Sample(single, Resampling(resamples=100))
-    frame = by_region(sample, "laplacian")
-    assert frame[["low", "high"]].isna().all(axis=None)
-    assert "RGB, all" in texts(draw_by_region(frame, sample, "LV"), tmp_path)

@@ -1,13 +1,8 @@
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from analysis.predictions.maps import MapSum, PixelMaps
-from rgbt.checks import InputError
 
 
 def maps(intersection: object, union: object) -> PixelMaps:
@@ -51,30 +46,3 @@ def test_mean_over_classes_by_hand() -> None:
     # pixels: a 2/4, b 1/1 | a 1/2, b absent | nothing labelled
     found = maps([[[2, 1, 0]], [[1, 0, 0]]], [[[4, 2, 0]], [[1, 0, 0]]])
     np.testing.assert_allclose(found.iou(), [[0.75, 0.5, np.nan]])
-
-
-def test_saved_and_loaded_are_equal(tmp_path: Path) -> None:
-    before = maps([[[2, 1]], [[1, 0]]], [[[4, 2]], [[1, 0]]])
-    before.save(tmp_path / "maps.npz")
-    after = PixelMaps.load(tmp_path / "maps.npz")
-    np.testing.assert_array_equal(after.intersection, before.intersection)
-    np.testing.assert_array_equal(after.union, before.union)
-    assert after.union.dtype == np.int32
-    nothing = np.zeros((2, 1, 1), np.int32)
-    without = {"intersection": nothing, "union": nothing}
-    assert replace(after, **without).__dict__.keys() == before.__dict__.keys()
-    for key in ("images", "classes", "palette", "dataset", "split", "name"):
-        assert getattr(after, key) == getattr(before, key)
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the file of pixel maps"):
-        PixelMaps.load(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("text")
-    with pytest.raises(InputError, match="not a readable file of pixel maps"):
-        PixelMaps.load(tmp_path / "text.npz")
-    np.savez(tmp_path / "other.npz", format=np.array("rgbt counts 1"))
-    with pytest.raises(InputError, match="not a readable file of pixel maps"):
-        PixelMaps.load(tmp_path / "other.npz")
-    with pytest.raises(ValueError, match="K=2"):
-        maps([[[1]], [[1]]], [[[1]]])

@@ -10,9 +10,9 @@ import pytest
 from analysis.predictions.scoring import ScoringOptions, find, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.data.predictions import Affixes, FormatOptions
+from rgbt.data.predictions import Affixes
 from rgbt.metrics.metric import Regions
-from tests.analysis.predictions.conftest import LABELS, PALETTE, PREDICTIONS, Write
+from tests.analysis.predictions.conftest import LABELS, PREDICTIONS, Write
 
 STRIPS = ScoringOptions(partitions=("vertical", "horizontal"), regions=2)
 
@@ -32,43 +32,6 @@ def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
     assert vertical.classes == tiny.classes
     assert (vertical.split, vertical.dataset) == ("test", tiny.fingerprint())
     assert scored.name == "pred"
-
-
-def test_unscored_classes_are_stored_with_counts(tiny: MFNet, write: Write) -> None:
-    tiny.unscored = ("person",)
-    scored = score_folder(write(PREDICTIONS), tiny, "test", STRIPS)
-    assert [counts.unscored for counts in scored.counts] == [("person",)] * 2
-    # Row 3 as below, without the person 0/1.
-    assert scored.maps is not None
-    np.testing.assert_allclose(scored.maps.iou()[3], [1.0, 1.0, 1 / 2, 1.0])
-
-
-def test_indices_palettes_and_colours_give_equal_counts(tiny: MFNet, write: Write) -> None:
-    from PIL import Image
-
-    indices = write(PREDICTIONS)
-    palettes, colours = write({}, "palettes"), write({}, "colours")
-    for name, prediction in PREDICTIONS.items():
-        image = Image.fromarray(np.array(prediction, np.uint8))
-        Image.fromarray(np.array(PALETTE, np.uint8)[np.array(image)]).save(colours / f"{name}.png")
-        image.putpalette(np.array(PALETTE, np.uint8).ravel().tolist())
-        image.save(palettes / f"{name}.png")
-    expected = score_folder(indices, tiny, "test", STRIPS).counts[0].counts
-    stated = replace(STRIPS, format=FormatOptions(form="colour"))
-    for folder, options in ((palettes, STRIPS), (palettes, stated), (colours, stated)):
-        found = score_folder(folder, tiny, "test", options)
-        np.testing.assert_array_equal(found.counts[0].counts, expected)
-
-
-def test_how_files_are_read_and_called_can_be_chosen(tiny: MFNet, write: Write) -> None:
-    folder = write({f"{name}_out": value for name, value in PREDICTIONS.items()})
-    with pytest.raises(InputError, match=r"lacks 2 of the 2 .*00001D\.png"):
-        score_folder(folder, tiny, "test", ScoringOptions(regions=2))
-    form = FormatOptions(affixes=Affixes(suffix="_out"))
-    chosen = ScoringOptions(partitions=("vertical",), regions=2, format=form, name="mine")
-    scored = score_folder(folder, tiny, "test", chosen)
-    np.testing.assert_array_equal(scored.counts[0].whole().sum(0), [26, 4, 1])
-    assert scored.name == "mine"
 
 
 def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write) -> None:
@@ -110,19 +73,7 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
     np.testing.assert_array_equal(one.maps.intersection.sum((1, 2)), right)
 
 
-def test_excluded_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
-    folder = write({"00002N": PREDICTIONS["00002N"]})
-    options = ScoringOptions(partitions=("vertical",), regions=2, missing="leave_out")
-    scored = score_folder(folder, tiny, "test", options)
-    assert scored.counts[0].names == ("00002N",)
-    assert scored.counts[0].night == (True,)
-    assert scored.counts[0].whole().sum() == 16
-    assert scored.missing == ("00001D",)
-    assert scored.maps is not None
-    assert scored.maps.images == 1
-
-
-def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write: Write) -> None:
+def test_other_size_is_refused_or_read_at_nearest_pixel(tiny: MFNet, write: Write) -> None:
     half = {name: np.array(value)[::2, ::2] for name, value in PREDICTIONS.items()}
     folder = write(half)
     with pytest.raises(
@@ -173,44 +124,21 @@ def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Wr
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]
 
 
-NAMES = ("00001D", "00002N")
-
-
-def put(folder: Path, *names: str) -> Path:
-    folder.mkdir()
-    for name in names:
-        (folder / name).touch()
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("form", "affixes"),
-    [("{}.png", ("", "")), ("{}_pred.png", ("", "_pred")), ("P_{}.png", ("P_", ""))],
-)
-def test_only_names_of_the_split_are_taken(
-    tmp_path: Path, form: str, affixes: tuple[str, str]
-) -> None:
-    others = ("mean.png", "00001D_overlay.png", "notes.txt")
-    folder = put(tmp_path / "p", *map(form.format, NAMES[::-1]), *others)
-    paths, missing, extra = find(folder, NAMES, Affixes(*affixes), "refuse")
-    assert list(paths.items()) == [(name, folder / form.format(name)) for name in NAMES]
-    assert missing == ()
+@pytest.mark.parametrize("affixes", [("", ""), ("", "_pred"), ("P_", "")])
+def test_only_names_of_the_split_are_taken(tmp_path: Path, affixes: tuple[str, str]) -> None:
+    names = ("00001D", "00002N")
+    stems = [f"{affixes[0]}{name}{affixes[1]}" for name in names]
+    for each in (*stems, "mean", "00001D_overlay"):
+        (tmp_path / f"{each}.png").touch()
+    paths, extra = find(tmp_path, names, Affixes(*affixes))
+    assert paths == [tmp_path / f"{stem}.png" for stem in stems]
     assert extra == ("mean",)  # pictures of rgbt.predict are no stray predictions
 
 
-def test_missing_files_are_refused_unless_excluded(tmp_path: Path) -> None:
-    folder = put(tmp_path / "p", "00001D.png")
-    with pytest.raises(InputError, match=r"lacks 1 of the 2 .*\(00002N\.png\).*missing=leave"):
-        find(folder, NAMES, Affixes(), "refuse")
-    paths, missing, _ = find(folder, NAMES, Affixes(), "leave_out")
-    assert (list(paths), missing) == (["00001D"], ("00002N",))
-
-
-@pytest.mark.parametrize("missing", ["refuse", "leave_out"])
-def test_folders_without_predictions(tmp_path: Path, missing) -> None:
+def test_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="predictions: no such folder"):
-        find(tmp_path / "none", NAMES, Affixes(), missing)
-    for files, held in (((), "nothing"), (("a.npy", "b.png", "c.png", "d.png"), "and 1 more")):
-        folder = put(tmp_path / held.split()[0], *files)
-        with pytest.raises(InputError, match=f"lacks 2 of the 2 .* contains .*{held}"):
-            find(folder, NAMES, Affixes(), missing)
+        find(tmp_path / "none", ("a",), Affixes())
+    for name in "bcde":
+        (tmp_path / f"{name}.png").touch()
+    with pytest.raises(InputError, match=r"lacks 1 of the 2 .*\(a\.png\).* contains .* and 1 more"):
+        find(tmp_path, ("a", "b"), Affixes())

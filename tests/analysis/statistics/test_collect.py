@@ -10,7 +10,6 @@ from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, 
 from analysis.statistics.measure import ImageMeasurements, ImageMeter
 from analysis.statistics.sample import Sample, occupancy_map
 from rgbt.checks import InputError
-from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Regions
 from rgbt.types import Sample as Image
 from tests.analysis.statistics.scenes import InMemory, random_sample
@@ -57,14 +56,6 @@ def test_does_not_depend_on_the_number_of_workers() -> None:
         assert_same(one, collect(dataset, "train", replace(SETTINGS, workers=workers)))
 
 
-def test_without_letters_there_is_one_part() -> None:
-    stats = collect(memory(["a", "b"]), "train", SETTINGS)
-    assert stats.night is None
-    assert stats.subsets() == ("all",)
-    with pytest.raises(InputError, match="part=day: .* states no such image"):
-        stats.chosen("day")
-
-
 def test_day_and_night_are_the_images_of_each() -> None:
     names = [f"{n:05d}{'DNN'[n % 3]}" for n in range(9)]
     dataset = memory(names)
@@ -78,31 +69,13 @@ def test_day_and_night_are_the_images_of_each() -> None:
             np.testing.assert_allclose(getattr(ours, name)(part), getattr(theirs, name)())
 
 
-def test_an_image_of_another_size_or_without_label_is_refused() -> None:
+def test_image_of_other_size_or_without_label_is_refused() -> None:
     rng = np.random.default_rng(0)
     first, other = random_sample("1D", (24, 32), rng), random_sample("2N", (24, 30), rng)
     with pytest.raises(InputError, match="'2N' is 24x30 pixels but '1D' is 24x32"):
         collect(InMemory([first, other]), "train", SETTINGS)
     with pytest.raises(InputError, match="'2N' has no label"):
         collect(InMemory([first, replace(other, label=None)]), "train", SETTINGS)
-
-
-def test_unreadable_file_is_refused_or_excluded(write_mfnet) -> None:
-    root = write_mfnet({"train": ["00001D", "00002N", "00003D"]})
-    (root / "images" / "00001D.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match="00001D.png cannot be decoded"):
-        collect(MFNet(str(root)), "train", SETTINGS)
-    told: set[str] = set()
-    skipping = replace(SETTINGS, skip_unreadable=True)
-    stats = collect(MFNet(str(root)), "train", skipping, unreadable=told.add)
-    assert stats.names == ("00002N", "00003D")
-    assert stats.night.tolist() == [True, False]
-    assert len(told) == 1
-    assert stats.occupied.sum() == 2 * 24 * 32
-    for name in ("00002N", "00003D"):
-        (root / "labels" / f"{name}.png").unlink()
-    with pytest.raises(InputError, match="none of the 3 images of mfnet can be read"):
-        collect(MFNet(str(root)), "train", skipping)
 
 
 @pytest.mark.parametrize("night", [True, False])
@@ -112,16 +85,6 @@ def test_file_round_trip(tmp_path: Path, night: bool) -> None:
     stats.save(tmp_path / "statistics.npz")
     assert [path.name for path in tmp_path.iterdir()] == ["statistics.npz"]
     assert_same(SpatialStatistics.load(tmp_path / "statistics.npz"), stats)
-
-
-@pytest.mark.parametrize("background", [("bump",), ("unlabeled", "bump"), ()])
-def test_background_is_that_of_the_data_set(tmp_path: Path, background: tuple[str, ...]) -> None:
-    dataset = memory(["a"])
-    dataset.background = background
-    collect(dataset, "train", SETTINGS).save(tmp_path / "statistics.npz")
-    loaded = SpatialStatistics.load(tmp_path / "statistics.npz")
-    assert loaded.background == background
-    assert loaded.is_background.tolist() == [name in background for name in dataset.classes]
 
 
 def test_images_are_measured_in_the_chosen_size() -> None:

@@ -8,9 +8,7 @@ import pytest
 from analysis.statistics.measure import (
     ESTIMATORS,
     HAAR_BINS,
-    MEDIAN_OF_NORMAL,
     ImageMeter,
-    RegionSums,
     grouped_median,
 )
 from rgbt.metrics.metric import Regions
@@ -75,17 +73,6 @@ def test_measure_against_a_loop_over_pixels(partition, regions, hw, kernel) -> N
         np.testing.assert_allclose(ours, wanted, rtol=1e-12)
 
 
-def test_rgb_is_measured_as_grey() -> None:
-    sample = random_sample("a", (8, 8), np.random.default_rng(0))
-    red = np.zeros((8, 8, 3), np.uint8)
-    red[..., 0] = 200
-    measured = ImageMeter(np.zeros((8, 8), np.uint8), 9)(
-        type(sample)(red, sample.thermal, sample.label, "a")
-    )
-    assert measured.mean[0, 0] == 60  # 0.299 * 200 = 59.8
-    assert measured.mean[1, 0] == pytest.approx(sample.thermal.mean())
-
-
 @pytest.mark.parametrize("shape", ["flat", "gradient"])
 def test_planted_noise_is_found_in_every_region(shape: str) -> None:
     hw = (240, 320)
@@ -115,32 +102,11 @@ def test_grouped_median_by_hand() -> None:
     assert np.isnan(found[2])
 
 
-@pytest.mark.parametrize(
-    ("partition", "regions", "hw"),
-    [("ring", 9, (60, 80)), ("vertical", 40, (60, 80)), ("horizontal", 3, (600, 20))],
-)
-def test_sums_of_any_partition(partition: str, regions: int, hw: tuple[int, int]) -> None:
-    region_map = regions_map(partition, regions, hw)
-    values = np.random.default_rng(0).integers(-(2**22), 2**22, hw).astype(np.int32)
-    expected = [int(values[region_map == r].astype(np.int64).sum()) for r in range(regions)]
-    assert RegionSums(region_map)(values).tolist() == expected
-
-
 def test_largest_values_do_not_overflow() -> None:
     """A checkerboard of 0 and 255 has the largest Laplacian there is, over 300 rows."""
     image = (np.indices((300, 300)).sum(0) % 2 * 255).astype(np.uint8)
     found = ImageMeter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
     assert found[0][0] == pytest.approx(1020.0**2)
-
-
-def test_noise_of_a_straight_edge_and_of_nothing() -> None:
-    image = np.full((40, 40), 50, np.uint8)
-    image[:, 20:] = 200
-    found = ImageMeter(np.zeros((40, 40), np.uint8), 9).measure(image)
-    assert found[IMMERKAER][0] == 0
-    # All magnitudes are 0: the median lies in the middle of [0, 0.5).
-    assert found[MAD][0] == pytest.approx(0.25 / 2 / MEDIAN_OF_NORMAL)
-    assert found[STD][0] == pytest.approx(75)
 
 
 def test_labels_are_counted_by_region() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,14 +65,6 @@ def test_occupancy_leaves_out_the_stated_background() -> None:
     found = occupancy_map(replace(plain, occupied=occupied))
     assert found[0, 0] == pytest.approx(3 / 8)
     assert np.isnan(found[1:]).all()
-
-
-@pytest.mark.parametrize("occupancy", [lambda s: Sample(s).occupancy(), occupancy_map])
-def test_without_background_there_is_no_occupancy(occupancy) -> None:
-    stats = made(classes=ROAD_FIRST, background=())
-    with pytest.raises(InputError, match="no class of made is stated as background"):
-        occupancy(stats)
-    assert not quantities(stats)["quantity"].eq("occupancy").any()
 
 
 def test_an_ignored_pixel_is_no_background() -> None:
@@ -157,7 +148,7 @@ def test_freedom_is_blocks_less_strata() -> None:
         assert found.error == pytest.approx(math.sqrt(6 / 5))
 
 
-def test_blocks_never_join_day_and_night_and_each_part_is_drawn_alone() -> None:
+def test_blocks_of_day_and_night_are_drawn_apart() -> None:
     sample = Sample(made(images=100), TENS)
     is_night = np.arange(100) >= 50
     for block in range(sample.blocks.count):
@@ -195,14 +186,3 @@ def test_intervals_cover_the_true_value() -> None:
     print(f"coverage {inside[10] / rounds:.3f}, without blocks {inside[1] / rounds:.3f}")
     assert 0.93 <= inside[10] / rounds <= 0.99
     assert inside[1] / rounds < 0.7
-
-
-def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    from analysis.statistics.collect import SpatialStatistics
-
-    path = tmp_path / "statistics.npz"
-    with pytest.raises(InputError, match="the file of statistics"):
-        SpatialStatistics.load(path)
-    np.savez(path, format=np.array("rgbt counts 1"))
-    with pytest.raises(InputError, match="is not a readable file of statistics"):
-        SpatialStatistics.load(path)

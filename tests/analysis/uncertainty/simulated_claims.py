@@ -14,8 +14,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from analysis.uncertainty.contrasts import Evidence
-from analysis.uncertainty.sequence import PRECISION, half_width
-from analysis.uncertainty.verdicts import Kind, Rule, decide
+from analysis.uncertainty.verdicts import PRECISION, Kind, Rule, decide, half_width
 
 HIGHER = (0.0, math.inf)
 BLOCKS = 40

@@ -118,14 +118,8 @@ def test_blocks_are_neighbours_of_one_sequence(names, choice, said: str, sizes: 
 @pytest.mark.parametrize(
     ("names", "choice", "word"),
     [
-        (
-            [*mfnet(20), "final"],
-            "sequence",
-            "blocks=sequence: names such as '00001D' show no neigh",
-        ),
         ([f"{c}_{n}" for n, c in enumerate("abcdefghijklm")], 5, "show no neighbouring frames"),
         (mfnet(100), 20, "blocks=20: 100 images make 5 blocks of up to 20"),
-        (mfnet(100) + mfnet(100, "N"), "sequence", "200 images make 2 sequences"),
     ],
 )
 def test_blocks_that_cannot_be_made_are_refused(names: list[str], choice, word: str):

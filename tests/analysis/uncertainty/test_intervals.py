@@ -42,7 +42,7 @@ def test_variance_interval_has_no_bias_and_holds_the_value() -> None:
     assert corrected(1.0, 0.9, Spread(1.0, 9), 0.95).low == 0.0
 
 
-def test_interval_of_absolute_differences_reaches_0_where_all_is_chance() -> None:
+def test_interval_of_absolute_differences_reaches_0_by_chance() -> None:
     # Resamples around a mean of 1.2, 0.2 above the value, whose quantiles are near 1.1 and 1.3.
     drawn = np.linspace(1.1, 1.3, 201)
     found = of_gaps(1.0, drawn, NONE, 0.95)

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from analysis.uncertainty import Comparison, Difference, Estimate, Interval
+from analysis.uncertainty import Comparison, Difference, Estimate, Interval, sentence
 from analysis.uncertainty.contrasts import Evidence
-from analysis.uncertainty.sentence import sentence
 
 
 def side(value: float, seeds: int, said: str = "", **values: Any) -> Estimate:

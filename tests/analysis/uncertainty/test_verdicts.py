@@ -7,11 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.intervals import Spread
-from analysis.uncertainty.sequence import half_width
 from analysis.uncertainty.verdicts import (
     ONE_START,
     AnyTime,
@@ -19,9 +18,19 @@ from analysis.uncertainty.verdicts import (
     Rule,
     Verdict,
     decide,
+    e_value,
+    half_width,
     similar,
 )
-from tests.analysis.uncertainty.simulated_claims import any_wrong, rates, until_decided, with_seeds
+from tests.analysis.uncertainty.simulated_claims import (
+    any_wrong,
+    ever_missed,
+    halves,
+    rates,
+    running,
+    until_decided,
+    with_seeds,
+)
 
 HIGHER, LOWER = (0.0, math.inf), (-math.inf, 0.0)
 FIXED, ANY = FixedSeeds(), AnyTime()
@@ -183,31 +192,32 @@ def test_more_seeds_never_widen_an_interval() -> None:
     """What the search for `seeds_needed` relies on."""
     for rule, error, blocks in itertools.product((FIXED, ANY), (0.0, 0.05, 0.3, 3.0), (10, 400)):
         images = Spread(error, blocks - 1)
-        widths = [rule.half(Spread(1 / math.sqrt(n), n - 1), images, 0.95) for n in range(2, 1001)]
+        counts = (*range(2, 40), *range(40, 1001, 40))
+        widths = [rule.half(Spread(1 / math.sqrt(n), n - 1), images, 0.95) for n in counts]
         finite = np.array([width for width in widths if math.isfinite(width)])
         assert (np.diff(finite) <= 1e-9).all(), (rule, error, blocks)
 
 
-# Rates, on 200 tables: bounds are 5 % and three standard errors. The page of the documentation has
+# Rates, on 100 tables: bounds are 5 % and three standard errors. The page of the documentation has
 # those of 1,000 tables (python -m tests.benchmarks.simulate_claims).
 
-BOUND = 0.05 + 3 * math.sqrt(0.05 * 0.95 / 200)
+BOUND = 0.05 + 3 * math.sqrt(0.05 * 0.95 / 100)
 
 
-def test_rates_of_a_rule_that_may_stop_at_any_time() -> None:
-    true, none = (rates(200, effect, 0.3, until_decided, ANY) for effect in (2.0, 0.0))
+def test_error_rates_of_rule_stopping_at_any_time() -> None:
+    true, none = (rates(100, effect, 0.3, until_decided, ANY) for effect in (2.0, 0.0))
     assert true.holds > 0.9
     assert true.contradicted <= 0.01
     assert none.holds + none.contradicted <= BOUND
     assert true.seeds < 12 < none.seeds
-    assert any_wrong(20, 10, 0.0, ANY) <= 0.25 + 3 * math.sqrt(0.25 * 0.75 / 20)
+    assert any_wrong(10, 10, 0.0, ANY) <= 0.25 + 3 * math.sqrt(0.25 * 0.75 / 10)
 
 
 def test_rates_of_looking_at_fixed_intervals_after_every_seed() -> None:
     """Why `until_decided` needs `AnyTime`: a true difference of 0 is decided far too often."""
-    looked = rates(100, 0.0, 0.0, until_decided, FIXED)
+    looked = rates(60, 0.0, 0.0, until_decided, FIXED)
     assert looked.holds + looked.contradicted > 2 * BOUND
-    once = rates(200, 0.0, 0.3, with_seeds(5), FIXED)
+    once = rates(100, 0.0, 0.3, with_seeds(5), FIXED)
     assert once.holds + once.contradicted <= BOUND
 
 
@@ -255,3 +265,63 @@ def test_rates_of_equivalence_at_its_margin() -> None:
     """A true difference as large as the margin is called none in at most 2.5 %."""
     holds, _ = simulated(lambda rng, n: 1.0 + 0.2 * rng.normal(size=n), 5, similar(1.0))
     assert 0.01 < holds < 0.042
+
+
+# The confidence sequence, by numerical integration and simulation.
+
+
+@pytest.mark.parametrize("count", [2, 5, 20])
+def test_e_value_is_mean_ratio_of_noncentral_t_densities(count: int) -> None:
+    precision = 0.25
+    for t in (0.5, 2.0, -4.0):
+
+        def ratio(effect: float, t: float = t) -> float:
+            density = stats.nct.pdf(t, count - 1, effect * math.sqrt(count))
+            return float(density) * stats.norm.pdf(effect, 0, precision**-0.5)
+
+        found, _ = integrate.quad(ratio, -12, 12, limit=200)
+        wanted = found / stats.t.pdf(t, count - 1)
+        assert e_value(t, count, precision) == pytest.approx(wanted, rel=1e-5)
+    assert e_value(3.0, 1) == 1.0  # without a variance
+
+
+@pytest.mark.parametrize("count", [4, 20, 300])
+def test_e_value_at_half_width_is_one_over_alpha(count: int) -> None:
+    for alpha in (0.025, 0.05):
+        half = half_width(1.7, count, alpha)
+        assert e_value(half * math.sqrt(count) / 1.7, count) == pytest.approx(1 / alpha)
+
+
+def test_half_width_is_infinite_where_no_t_decides() -> None:
+    """The largest e-value of n values is r^((1 - n) / 2): 11.7 for 3, and 70 for 4."""
+    assert [math.isinf(half_width(1.0, count, 0.05)) for count in (1, 2, 3, 4)] == [True] * 3 + [
+        False
+    ]
+    assert half_width(0.0, 4, 0.05) == 0.0
+    widths = halves(1000, 0.025)
+    finite = widths[np.isfinite(widths)]
+    assert len(finite) == 997
+    assert (np.diff(finite) < 0).all()
+
+
+def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
+    """1500 sequences of 2 to 200 values; the t interval alone misses in more than half of them."""
+    rng, factors = np.random.default_rng(1), halves(200, 0.05)
+    naive = stats.t.ppf(0.975, np.arange(1, 200)) / np.sqrt(np.arange(2, 201))
+    drawn = [running(rng, 200) for _ in range(1500)]
+    missed, fixed = (
+        np.mean([(np.abs(means) > sds * each).any() for means, sds in drawn])
+        for each in (factors, naive)
+    )
+    assert 0.01 < missed < 0.05
+    assert fixed > 0.3
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 3.0])
+def test_images_and_seeds_miss_in_less_than_alpha(ratio: float) -> None:
+    """`AnyTime` joins squares at half of the error rate each; the whole rate is too much."""
+    missed = ever_missed(1500, 200, ratio)
+    assert missed["squares, half"] < 0.05
+    assert missed["sum, half"] <= missed["squares, half"] <= missed["squares, whole"]
+    if ratio == 0.2:
+        assert missed["squares, whole"] > 0.05

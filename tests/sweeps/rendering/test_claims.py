@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from rgbt.terminal import rich_table
-from sweeps.rendering.claims import claim_grids, claims_frame
+from sweeps.rendering.claims import WORDS, claim_grids, claims_frame
 from sweeps.table.claim import Claim
 from sweeps.table.table import Row
 from sweeps.verdicts.judge import TableJudge
@@ -30,12 +30,12 @@ def test_no_verdict_is_cut(width: int) -> None:
     rows = tuple(Row(label=label, experiment="crm") for label in shares)
     judge = TableJudge("a_paper/a_table", table(rows, claims=claims), resamples=100)
     frame = claims_frame(judge.claims(planted(shares)))  # type: ignore[arg-type]
-    for narrow in (True, False):
-        console = Console(file=io.StringIO(), width=width)
-        for grid in claim_grids(frame, narrow=narrow):
-            console.print(rich_table(grid))
-        shown = console.file.getvalue()  # type: ignore[attr-defined]
-        words = [line.split()[0] for line in shown.splitlines() if line.strip()]
-        assert {"holds", "contradicted", "undecided"} <= set(words)
-        assert max(map(len, shown.splitlines())) <= width
-        assert "…" not in shown
+    console = Console(file=io.StringIO(), width=width)
+    for grid in claim_grids(frame, noted=True):
+        console.print(rich_table(grid))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    words = [line.split()[0] for line in shown.splitlines() if line.strip()]
+    assert [word for word in words if word in WORDS] == ["holds", "contradicted", "undecided"]
+    assert max(map(len, shown.splitlines())) <= width
+    assert "…" not in shown
+    assert "more images" in shown or "seeds" in shown

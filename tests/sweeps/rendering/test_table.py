@@ -25,43 +25,41 @@ from tests.sweeps.tabled import Made, failed, outcome, right, table
 
 MARKS = {("b", "acc"): 1, ("a_1", "acc"): 2}
 ROWS = {"a_1": ((40, 50, 60), 48.0), "b": ((60, 70, 80), 47.5), "theirs": ((), 50.0)}
-STACKED = tuple(Column(name=f"name_{n}", metric="pixel_accuracy") for n in range(4))
+COLUMNS = tuple(Column(name=f"name_{n}", metric="pixel_accuracy") for n in range(4))
 
 
 def wide(**others: Any) -> ScoredTable:
     rows = (Row(label="a", experiment="crm", values={"name_0": 48.0, "name_1": 49.25}),)
     runs = {("a", seed): outcome(str(seed), right(share)) for seed, share in enumerate((40, 60))}
-    return score("own/wide", table(rows, STACKED, **others), runs, scale="paper")
+    return score("own/wide", table(rows, COLUMNS, **others), runs, scale="paper")
 
 
 def grid(scored: ScoredTable, **others: Any) -> TextTable:
     return render_table(scored, TERMINAL, **others)
 
 
-def test_few_columns_are_on_one_line() -> None:
+def test_lines_are_ours_published_and_difference() -> None:
     shown = grid(Made(ROWS).scored(MARKS))
     assert shown.title == "own, TABLE I: Rows"
-    assert shown.header == ("", "seeds", "acc", "published", "difference")
+    assert shown.header == ("", "", "seeds", "acc")
     assert shown.rows == (
-        ("a_1", "3", "_50.00 ± 10.00", "48.0", "+2.00"),
-        ("b", "3", "*70.00 ± 10.00", "47.5", "+22.50"),
-        ("theirs", "", "-", "50.0", "-"),
+        ("a_1", "ours", "3", "_50.00 ± 10.00"),
+        *(("", "published", "", "48.0"), ("", "difference", "", "+2.00")),
+        ("b", "ours", "3", "*70.00 ± 10.00"),
+        *(("", "published", "", "47.5"), ("", "difference", "", "+22.50")),
+        ("theirs", "published", "", "50.0"),
     )
     assert "**70.00 ± 10.00**" in render_table(Made(ROWS).scored(MARKS), MARKDOWN).to_markdown()
 
 
-def test_many_columns_use_separate_lines() -> None:
+def test_paper_scale_is_not_called_small() -> None:
     shown = grid(wide())
-    assert shown.rows == (
-        ("a", "ours", "2", *["50.00 ± 14.14"] * 4),
-        ("", "published", "", "48.00", "49.25", "-", "-"),
-        ("", "difference", "", "+2.00", "+0.75", "-", "-"),
-    )
+    assert shown.rows[1] == ("", "published", "", "48.00", "49.25", "-", "-")
     assert SMALL.format(scale="paper") not in shown.notes
 
 
 def test_footnotes_are_numbered_and_shared() -> None:
-    columns = (*STACKED[:3], Column(name="TC", metric="TC", frames="aligned", printed=False))
+    columns = (*COLUMNS[:3], Column(name="TC", metric="TC", frames="aligned", printed=False))
     rows = (
         Row(label="a", experiment="crm", remarks=("of a",)),
         Row(label="b", experiment="crm"),
@@ -84,7 +82,7 @@ def test_rows_of_the_same_runs_and_commits_are_noted() -> None:
     runs = {(label, seed): run for label in "ab" for seed, run in enumerate(made)}
     shown = grid(score("t", table(rows), runs, scale="demo"), extra=["x=1"], remarks=["more"])
     assert shown.notes[0] == "[1] At scale=demo the same runs as row 'a'."
-    assert shown.rows[1][0] == "b[1]"
+    assert shown.rows[1][:2] == ("b[1]", "ours")
     for remark in (
         "Our runs come from several git commits: aaa (1), bbb (1).",
         *("Every row of ours was run with x=1.", "more"),
@@ -103,8 +101,16 @@ def test_sizes_have_no_seeds() -> None:
     scored = score("own/t", made, {}, scale="demo", sizes=counted)
     shown = grid(replace(scored, marks=size_marks(made, counted)))
     assert shown.rows == (
-        ("a", "", "_54.36", "54.4", "-0.04"),
-        ("b", "", "*44.56", "44.6", "-0.04"),
+        *(
+            ("a", "ours", "", "_54.36"),
+            ("", "published", "", "54.4"),
+            ("", "difference", "", "-0.04"),
+        ),
+        *(
+            ("b", "ours", "", "*44.56"),
+            ("", "published", "", "44.6"),
+            ("", "difference", "", "-0.04"),
+        ),
     )
     assert COUNTED in shown.notes
     assert not any("scale=demo" in note for note in shown.notes)
@@ -114,8 +120,7 @@ def test_sizes_have_no_seeds() -> None:
 
 def test_latex_escapes_and_omits_differences() -> None:
     text = latex(grid(Made(ROWS).scored(MARKS)))
-    assert r"\begin{tabular}{lrrrr}" in text
-    assert r"a\_1 & 3 & \_50.00 ± 10.00 & 48.0 & +2.00 \\" in text
-    stacked = latex(grid(wide(caption=r"50% of A_b {c}")))
-    assert r"50\% of A\_b \{c\}" in stacked
-    assert "difference" not in stacked
+    assert r"\begin{tabular}{lrrr}" in text
+    assert r"a\_1 & ours & 3 & \_50.00 ± 10.00 \\" in text
+    assert "difference" not in text
+    assert r"50\% of A\_b \{c\}" in latex(grid(wide(caption=r"50% of A_b {c}")))

@@ -91,29 +91,26 @@ def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> 
     assert len({each.path for each in worlds}) == 4
 
 
-def design(generators: dict[str, str], letters: str = "OCNS") -> tuple[Design, Part]:
+def design(generators: dict[str, str], letters: str = "OCNS") -> Design:
     factors = tuple(
         DesignFactor(letter=each, name=each.lower(), low_means="", high_means="")
         for each in letters
     )
-    part = Part(generators=generators)
-    methods = (DesignMethod(name="m", experiment="crm"),)
-    return Design(factors=factors, methods=methods, outcomes=("mIoU",), trained=part), part
+    part, methods = Part(generators=generators), (DesignMethod(name="m", experiment="crm"),)
+    return Design(factors=factors, methods=methods, outcomes=("mIoU",), trained=part)
 
 
 def test_half_fraction_has_the_product_as_last_level() -> None:
-    made, part = design({"S": "OCN"})
     # S is high where an odd number of O, C and N is high.
-    assert [cell_name(cell) for cell in made.cells(part)] == [
+    assert [cell_name(cell) for cell in design({"S": "OCN"}).cells("trained")] == [
         *("O-C-N-S-", "O-C-N+S+", "O-C+N-S+", "O-C+N+S-"),
         *("O+C-N-S+", "O+C-N+S-", "O+C+N-S-", "O+C+N+S+"),
     ]
 
 
 def test_half_fraction_mixes_pairs_of_interactions_alone() -> None:
-    made, part = design({"S": "OCN"})
     # I = OCNS, so OC = NS, ON = CS and CN = OS.
-    assert made.effects(part) == {
+    assert design({"S": "OCN"}).effects("trained") == {
         **{"o": {"O": 1}, "c": {"C": 1}, "n": {"N": 1}, "s": {"S": 1}},
         **{"o x c + n x s": {"OC": 1, "NS": 1}, "o x n + c x s": {"ON": 1, "CS": 1}},
         "o x s + c x n": {"OS": 1, "CN": 1},
@@ -142,7 +139,7 @@ def test_design_refuses_parts_that_do_not_fit(
 
 
 def test_resolution_three_is_refused() -> None:
-    made, _ = design({"N": "OC"}, "OCN")
+    made = design({"N": "OC"}, "OCN")
     with pytest.raises(InputError, match="O cannot be told apart from CN"):
         check_value("design", asdict(made), Design)
 
@@ -151,10 +148,7 @@ def test_study_of_the_spatial_bias_has_its_cells() -> None:
     table = load_table("spatial_bias")
     made = table.design
     assert made is not None
-    assert made.trained is not None
-    assert made.tested is not None
-    assert len(made.cells(made.trained)) == 8
-    assert len(made.cells(made.tested)) == 16
+    assert [len(made.cells(part)) for part in ("trained", "tested")] == [8, 16]
     assert len(table.rows) == 5 * 8 + 5
     # Both levels of a radial factor have the same mean square over an image of 3 x 4, where the
     # mean of r^2 is 1/3 and that of r^4 (256/5 + 81/5 + 2 x 144/9) / 625.

@@ -164,7 +164,7 @@ def test_predictions_have_the_counts_of_rgbt_score(
     assert [command[0] for command in commands] == ["analysis.score"]
 
 
-def test_weights_have_the_counts_of_the_run_that_trained_them(
+def test_weights_have_the_counts_of_their_training_run(
     trained: Trained, commands: Commands, runs_of: Runs
 ) -> None:
     run = trained(*ONE)

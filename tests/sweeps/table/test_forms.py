@@ -1,16 +1,18 @@
-"""Rows of the papers' tables in both forms: what each row changes, and which rows are one run."""
+"""Rows of the papers' tables in both forms: what each changes, which are one run, what is said."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from fnmatch import fnmatch
 from functools import cache
-from itertools import product
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
+from rgbt.config.command import composing
+from rgbt.config.component import build
 from rgbt.config.compose import flatten
 from rgbt.runs.run_spec import RunSpec
 from sweeps.table.efficiency import million_parameters
@@ -24,7 +26,10 @@ from tests.composed import specified
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 FORMS: tuple[Form, ...] = get_args(Form)
 SLOW = pytest.mark.slow
-SCALES = pytest.mark.parametrize("scale", ["demo", pytest.param("paper", marks=SLOW)])
+SCALES = ["demo", *(pytest.param(scale, marks=SLOW) for scale in ("bench", "paper"))]
+
+SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
+"""Losses of the second view by the setting of the loss of Temporal."""
 
 IGNORED = ("name", "seed", "consistency", "recipe", "scale")
 """Nodes that are not compared: labels, evaluations, and what other nodes take their values from."""
@@ -225,15 +230,49 @@ def check_difference(found: set[str], text: str, scale: str, what: str) -> None:
 
 # Rows of several releases differ in more than a row is about.
 SEVERAL = [(name, "released") for name in ("multihead/table3", "multihead/table4")]
-EVERY = [each for each in product(EXPECTED, FORMS) if each not in SEVERAL]
 
 
-@SCALES
-@pytest.mark.parametrize(("name", "form"), EVERY)
-def test_row_differs_from_the_row_above_in_intended_settings(
-    name: str, form: Form, scale: str
-) -> None:
-    found = runs(name, form, scale)
+class Composed(Planner):
+    """A planner that shares what other tests have composed."""
+
+    def specify(self, overrides: tuple[str, ...], *, checked: bool = True) -> RunSpec:
+        scaled = [word for word in overrides if word.startswith("scale=")] or ["scale=demo"]
+        rooted = [word for word in overrides if word.startswith("dataset.root=")]
+        others = [word for word in overrides[:-1] if word not in (*scaled, *rooted)]
+        with composing(overrides):
+            return specified((*others, *scaled, *rooted))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", [*TABLES, *study_names()])
+def test_rows_of_a_table(name: str, scale: str) -> None:
+    """Each row is composed once: a third of the time of most tests."""
+    # What a command checks of the tables of a user alone.
+    extra = ("dataset.root=/data",) if scale == "paper" and name in TABLES else ()
+    for form in FORMS:
+        request = TableRequest(name, load_table(name), scale, (0,), extra, form=form)
+        check_equal_runs(request, Composed())
+    if name not in TABLES or scale == "bench":
+        return
+    paper, released = (runs(name, form, scale) for form in FORMS)
+    for form, found in zip(FORMS, (paper, released), strict=True):
+        if name in EXPECTED and (name, form) not in SEVERAL:
+            check_rows_above(name, form, scale, found)
+    for row in TABLES[name].runnable_rows:
+        is_same = paper[row.label].key == released[row.label].key
+        assert scale == "paper" or is_same == (row.released is None), row.label
+        if row.released is not None and name[0] in "cs":
+            full = f"{name} {row.label}"
+            text = next(text for pattern, text in RELEASES.items() if fnmatch(full, pattern))
+            check_difference(difference(paper[row.label], released[row.label]), text, scale, full)
+        if row.same_as and scale == "demo":
+            assert paper[row.label].key == paper[row.same_as].key
+        if scale == "demo":
+            check_printed_settings(name, row, OmegaConf.create(dict(paper[row.label].plain)))
+
+
+def check_rows_above(name: str, form: Form, scale: str, found: Mapping[str, RunSpec]) -> None:
+    """A row differs from the row above it in the intended settings."""
     for above, label in zip(found, list(found)[1:], strict=False):
         paper, _, released = EXPECTED[name].get(label, "Swin").partition(" // ")
         text = released or paper if form == "released" else paper
@@ -241,40 +280,72 @@ def test_row_differs_from_the_row_above_in_intended_settings(
         check_difference(difference(found[label], found[above]), text, scale, label)
 
 
-@SCALES
-@pytest.mark.parametrize("name", [name for name in TABLES if name[0] in "cs"])
-def test_released_form_changes_the_intended_settings(name: str, scale: str) -> None:
-    paper, released = (runs(name, form, scale) for form in FORMS)
-    for row in (each for each in TABLES[name].runnable_rows if each.released is not None):
-        full = f"{name} {row.label}"
-        text = next(text for pattern, text in RELEASES.items() if fnmatch(full, pattern))
-        check_difference(difference(paper[row.label], released[row.label]), text, scale, full)
+def assert_printed(row: Row, found: dict[str, Any]) -> None:
+    """What is found of a row's configuration is what the paper prints about it."""
+    printed = {key: value for key, value in row.settings.items() if value is not None}
+    shared = set(printed) & set(found)
+    assert {key: printed[key] for key in shared} == {key: found[key] for key in shared}
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_row_has_a_released_form_where_its_run_differs(name: str) -> None:
-    paper, released = (runs(name, form, "demo") for form in FORMS)
-    for row in TABLES[name].runnable_rows:
-        is_same = paper[row.label].key == released[row.label].key
-        assert is_same == (row.released is None), row.label
+def check_printed_settings(name: str, row: Row, config: DictConfig) -> None:
+    masker, loss = config.masker, config.loss
+    assert min(build(masker).grid_hw(tuple(config.transform.crop_hw))) > 1
+    found = {
+        "patch_size": 2 * (masker.patch_size or 0),  # pixels are halved at demo scale
+        "alpha": loss.get("spatial", loss).get("alpha"),
+        "beta": loss.get("beta"),
+        "focus": loss.get("spatial", {}).get("focus"),
+        "masking_ratio": masker.ratio,
+        "masking": {"indiv": "irm", "rand_comp": "crm", "comp": "crm_pair"}.get(
+            masker.pairing or ""
+        ),
+    }
+    if masker.sigma_div is not None:
+        found["sigma_p"] = "Ny" if masker.sigma_div == 1 else f"Ny/{masker.sigma_div:g}"
+    assert_printed(row, found)
+    if not name.startswith("temporal"):
+        return
+    first, second = ["seg1"], []
+    if "second" in loss:
+        first += ["dice1"] if loss.alpha else []
+        second = ["seg2", *SECOND[loss.second]]
+        assert bool(loss.beta) == (loss.second != "none")
+        assert loss.form == "paper"
+    assert (row.settings["losses_img1"], row.settings["losses_img2"]) == (first, second)
+    assert row.settings["network"] in config.model["_target_"].lower()
+    mode = config.scheme.view.mode if "view" in config.scheme else "neither"
+    views = {"rotation": ("rotation", "both"), "translation": ("translation", "both")}
+    if name == "temporal/table2":
+        assert_printed(row, {key: mode in modes for key, modes in views.items()})
 
 
-@pytest.mark.parametrize("scale", ["demo", pytest.param("bench", marks=SLOW), "paper"])
-@pytest.mark.parametrize("name", [*TABLES, *study_names()])
-def test_rows_of_one_run_are_declared(name: str, scale: str) -> None:
-    """What a command checks of the tables of a user alone."""
-    extra = ("dataset.root=/data",) if scale == "paper" and name in TABLES else ()
-    for form in FORMS:
-        request = TableRequest(name, load_table(name), scale, (0,), extra, form=form)
-        check_equal_runs(request, Planner())
+TWICE = (
+    "spatialseg/table3 Ny/4 | spatialseg/table4 PS 64 | spatialseg/table5 alpha 0"
+    " | spatialseg/table6 no weighting",
+    "spatialseg/table5 alpha 2 | spatialseg/table6 Edge | spatialseg/table7 Ours (Swin-S)",
+    "crm/table1 Ours | crm/table2a Ours (Swin-S) | crm/table3a Ours | crm/table3b Patch (32)"
+    " | crm/table4 CRM",
+    "temporal/table1 (A) | temporal/table2 (A)",
+    "temporal/table1 (G) | temporal/table4 Ours-dice",
+    "temporal/table1 (H) | temporal/table2 (D) | temporal/table3 (E) | temporal/table4 Ours-con",
+    "temporal/table1 (I) | temporal/table4 Ours-con-acc",
+    "multihead/table2 HeatNet (reproduced) | multihead/table3 HeatNet*",
+    "multihead/table2 HeatNet RGB-only (reproduced) | multihead/table4 HeatNet RGB-only*",
+)
+MAIN = ("mIoU", "rgbt_mIoU", "mIoU_day", "mIoU_rgb")
 
 
-def test_rows_declared_as_the_same_share_a_run_at_demo_scale() -> None:
-    pairs = [(name, row) for name, table in TABLES.items() for row in table.rows if row.same_as]
-    assert pairs
-    for name, row in pairs:
-        found = runs(name, "paper", "demo")
-        assert found[row.label].key == found[row.same_as or ""].key
+@pytest.mark.parametrize("scale", SCALES[::2])
+def test_rows_printed_twice_are_one_run(scale: str) -> None:
+    for cells in TWICE:
+        keys, printed = set(), set()
+        for name, _, label in (cell.partition(" ") for cell in cells.split(" | ")):
+            (row,) = (each for each in TABLES[name].rows if each.label == label)
+            keys.add(run_of(TABLES[name], row, "paper", scale).key)
+            value = next(row.values[key] for key in MAIN if row.values.get(key) is not None)
+            assert value is not None
+            printed.add(round(value, 1))
+        assert (len(keys), len(printed)) == (1, 1), cells
 
 
 def upstream_names(run: RunSpec) -> set[str]:
@@ -313,9 +384,7 @@ STARRED = {
 
 
 @pytest.mark.parametrize(("name", "label"), STARRED)
-def test_starred_rows_as_released_are_the_basic_network_in_two_stages(
-    name: str, label: str
-) -> None:
+def test_released_starred_rows_train_basic_network_in_two_stages(name: str, label: str) -> None:
     """The scripts import the basic network; the modified decoder is that of the paper's form."""
     (row,) = (each for each in TABLES[name].rows if each.label == label)
     paper, second = (run_of(TABLES[name], row, form, "paper") for form in FORMS)
@@ -350,7 +419,29 @@ def test_network_for_weights_is_the_published_one(network: tuple[str, ...]) -> N
     assert run.dataset.plain["name"] == expected
     assert run.model.plain["num_classes"] == run.dataset.plain["num_classes"]
     model = next(word for word in network if word.startswith("model=")).removeprefix("model=")
-    assert million_parameters(words) == pytest.approx(MILLIONS[model], rel=1e-3)
+    assert million_parameters(tuple(words)) == pytest.approx(MILLIONS[model], rel=1e-3)
     inputs = run.model.plain["inputs"]
     if "cmx" in model:  # the public weights
         assert (inputs["rgb_order"], run.model.plain["decoder_norm_eps_eval"]) == ("bgr", 1e-5)
+
+
+@pytest.mark.parametrize("number", [3, 4, 5, 6])
+def test_printed_variance_is_the_population_variance_of_the_rings(number: int) -> None:
+    for row in TABLES[f"spatialseg/table{number}"].rows:
+        rings = [row.values[f"IoU{ring}"] for ring in range(1, 6)]
+        mean = sum(value for value in rings if value is not None) / 5
+        variance = sum((value - mean) ** 2 for value in rings if value is not None) / 5
+        printed = row.values["Var"]
+        assert printed is not None
+        assert (abs(variance - printed) > 0.02) == ("Var" in row.doubtful), (row.label, variance)
+
+
+@pytest.mark.parametrize("number", [2, 3, 4])
+def test_printed_mean_is_that_of_both_columns(number: int) -> None:
+    table = TABLES[f"multihead/table{number}"]
+    mean = next(column for column in table.columns if column.name == "mean_mIoU")
+    for row in table.rows:
+        known = [row.values.get(name) for name in (*mean.sources, "mean_mIoU")]
+        if None not in known:
+            first, second, printed = (value or 0.0 for value in known)
+            assert printed == pytest.approx((first + second) / 2, abs=0.0501), row.label

@@ -19,9 +19,8 @@ SMALL: dict[str, Any] = {
     "caption": "Cells of two sizes.",
     "data": "nothing yet",
     "columns": [{"name": "mIoU", "metric": "mIoU"}, {"name": "Var", "metric": "Var"}],
-    "factor": {"name": "size", "axis": "log"},
     "rows": [
-        {"label": "small", "experiment": "grbm", "overrides": ["masker.sigma_div=1"], "x": 1},
+        {"label": "small", "experiment": "grbm", "overrides": ["masker.sigma_div=1"]},
         {"label": "large", "settings": {"kind": "a"}, "values": {"mIoU": 61, "Var": None}},
     ],
 }
@@ -49,8 +48,9 @@ def behind(**keys: Any) -> dict[str, Any]:
 
 
 def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
-    write(tmp_path)
+    write(tmp_path, number=1)
     table = load_table("my/ablation", tmp_path)
+    assert table.number == "1"
     assert [row.label for row in table.rows] == ["small", "large"]
     assert (table.unit, table.regions, table.absent) == ("percent", "as trained", None)
     assert table.columns[1].best == "highest"
@@ -84,7 +84,6 @@ def claim(**keys: Any) -> dict[str, Any]:
         (row(experiment="grmb"), "experiment: 'grmb'.*did you mean 'grbm'"),
         (row(at={"papr": ["a=1"]}), "at: 'papr'"),
         (row(same_as="large"), "same_as"),
-        (row(x=0), "'x'"),
         ({"rows": [{"label": "a"}, {"label": "a"}]}, "'a' is used twice"),
         ({"at": {"big": []}}, "at: 'big'"),
         (column(metric="Var", name="mIoU"), "'mIoU' is used twice"),

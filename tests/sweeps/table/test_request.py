@@ -6,9 +6,11 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.config.compose import available, compose
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
@@ -115,6 +117,31 @@ def test_form_and_rows_make_another_table() -> None:
     assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
 
 
+def test_both_forms_are_compared_by_claims() -> None:
+    name, published = read_named("spatialseg/table3")
+    typed = TableRequest(name, published, "demo", (0,))
+    request, _ = make_request(typed, "Ny/4,Ny/8", both=True)
+    labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
+    assert [row.label for row in request.table.rows] == labels
+    words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
+    assert words_of == ["+experiment=grbm", "+experiment=grbm_released"]
+    claims = request.table.claims
+    assert [(c.rows, c.against, c.columns) for c in claims[:2]] == [
+        (("Ny/4, released",), ("Ny/4",), (column,)) for column in ("mIoU", "Var")
+    ]
+    assert len(claims) == 4
+
+
+@pytest.mark.parametrize("scale", available("scale"))
+def test_every_seed_of_a_table_has_a_start_of_its_own(scale: str) -> None:
+    """A verdict about one start would not be general."""
+    request = TableRequest("t", load_table("spatialseg/table3"), scale, (0,))
+    config = compose(request.overrides("Ny/4", 0))
+    is_common = str(config.pretrained).startswith("common:")
+    assert is_common == (scale == "bench")
+    assert not is_common or config.seeds.start == "run"
+
+
 def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
     about: Any = {"says": "", "source": "", "columns": ("acc",), "expected": "higher"}
     return Claim(name=name, rows=rows, against=against, **about)
@@ -135,7 +162,7 @@ def test_selected_rows_keep_their_claims() -> None:
     assert select_rows(made, "a,b,c").claims == made.claims
 
 
-def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
+def test_twins_of_a_row_left_out_stay_declared() -> None:
     rows = (
         Row(label="a", experiment="crm"),
         Row(label="b", experiment="crm", same_as="a"),
@@ -150,7 +177,7 @@ def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
         select_rows(table(rows), "e")
 
 
-def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
+def test_undeclared_rows_of_one_run_are_refused() -> None:
     first, third = (Row(label=each, experiment="baseline") for each in "ac")
     same = Row(label="b", experiment="baseline", same_as="a")
     with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):

@@ -12,7 +12,7 @@ from sweeps.worker.planner import Planner
 MISSING = "missing_image"
 
 
-def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
+def test_missing_image_has_the_runs_of_crm_ablation() -> None:
     """Rows of crm/table3a cost nothing more than two evaluations of each run."""
     planner = Planner()
 
@@ -36,7 +36,7 @@ def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
 
 
 @pytest.mark.parametrize("task", ["night", pytest.param("thermal", marks=pytest.mark.slow)])
-def test_self_training_is_compared_with_as_many_steps_of_the_same_start(task: str) -> None:
+def test_self_training_is_compared_at_equal_steps_and_start(task: str) -> None:
     """All second stages of one head start from one run, the source alone among them."""
     name = f"self_training_{task}"
     request, _ = make_request(TableRequest(name, load_table(name), "bench", (0,)))

@@ -4,7 +4,7 @@ import pytest
 
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row
-from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, printed_value
+from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, difference
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -45,13 +45,13 @@ def test_contrasts_of_a_claim(others: dict[str, object], labels: list[str]) -> N
 @pytest.mark.parametrize(
     ("contrast", "value"),
     [
-        (Contrast("b", "a", "inner"), 5.0),
-        (Contrast("b", "a", "inner", "outer"), 5.0 - 1.0),
-        (Contrast("c", "a", "outer"), None),
+        (difference("b", "a", "inner"), 5.0),
+        (difference("b", "a", "inner", "outer"), 5.0 - 1.0),
+        (difference("c", "a", "outer"), None),
     ],
 )
 def test_printed_value_of_a_contrast(contrast: Contrast, value: float | None) -> None:
-    assert printed_value(contrast, TABLE) == value
+    assert contrast.printed(TABLE) == value
 
 
 def test_derived_columns_are_sums_of_scores() -> None:

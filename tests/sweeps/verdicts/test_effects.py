@@ -12,7 +12,7 @@ from sweeps.table.cells import world_evaluations
 from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
-from sweeps.verdicts.effects import MEAN, DesignJudge, judged_claims
+from sweeps.verdicts.effects import MEAN, Effects, effects_of
 from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
@@ -75,9 +75,13 @@ def trained(seeds: int = 2) -> dict[tuple[str, int], Any]:
     return runs
 
 
+def effects(table: Table, runs: Any) -> Effects:
+    return effects_of(TableJudge("own/t", table, resamples=100), runs)
+
+
 def estimates(table: Table, runs: Any) -> dict[tuple[str, str, str], Any]:
-    lines = DesignJudge(table, resamples=100).effects(runs).lines
-    return {(line.method, line.against, line.effect): line.estimate for line in lines}
+    lines = effects(table, runs).frame.itertuples()
+    return {(line.method, line.against, line.effect): line for line in lines}  # type: ignore[misc]
 
 
 def test_effects_are_of_contrasts_within_runs() -> None:
@@ -92,12 +96,12 @@ def test_effects_are_of_contrasts_within_runs() -> None:
     assert found["crm", "baseline", "noise"].value == pytest.approx(own - EFFECT)
 
 
-def test_method_with_a_missing_cell_is_named_and_others_are_analysed() -> None:
+def test_method_with_missing_cell_is_named_others_are_analysed() -> None:
     runs = trained()
     for seed in (0, 1):
         runs["crm N+T-", seed] = failed("no memory")
-    found = DesignJudge(design_table(), resamples=100).effects(runs)
-    assert {line.method for line in found.lines} == {"baseline"}
+    found = effects(design_table(), runs)
+    assert set(found.frame["method"]) == {"baseline"}
     assert found.missing == ("trained, crm: row 'crm N+T-' has no finished run.",)
 
 
@@ -127,17 +131,17 @@ def test_claims_about_effects_are_judged() -> None:
     )
     made = replace(design_table(), claims=claims)
     judge = TableJudge("own/t", made, resamples=100)
-    worse, better, texture = judged_claims(judge, trained(3))  # type: ignore[arg-type]
+    worse, better, texture = judge.claims(trained(3))  # type: ignore[arg-type]
     assert [each.word for each in (worse, better)] == ["holds", "contradicted"]
     assert texture.word != "holds"
     assert worse.verdict is not None
     assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
     assert "N+ - N- (trained)" in worse.contrast
     unfinished = {run: each for run, each in trained(3).items() if run[0] != "baseline N+T-"}
-    assert judged_claims(judge, unfinished)[0].word == "not run"  # type: ignore[arg-type]
+    assert judge.claims(unfinished)[0].word == "not run"  # type: ignore[arg-type]
 
 
-def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
+def test_networks_tested_in_worlds_use_counts_of_each() -> None:
     table = design_table(trained=None, tested=Part())
     worlds = world_evaluations(table, table.rows[0])
     assert list(worlds) == list(CELLS)

@@ -84,7 +84,7 @@ def test_rows_of_decided_claims_get_no_more_seeds() -> None:
     assert seeds(complete(adding(TRUE, FALSE))) == expected
 
 
-def test_rows_of_undecided_claims_get_seeds_up_to_the_largest_number() -> None:
+def test_rows_of_undecided_claims_get_seeds_up_to_maximum() -> None:
     until = adding(TRUE, OPEN)
     outcomes = complete(until)
     assert seeds(outcomes) == {"ours": DECIDED, "base": MAX, "twin": MAX, "other": START}
@@ -99,7 +99,7 @@ def test_rows_of_undecided_claims_get_seeds_up_to_the_largest_number() -> None:
     assert {each.point.overrides for each in outcomes} <= most
 
 
-def test_added_points_are_of_one_seed_and_name_the_rule() -> None:
+def test_added_points_have_one_seed_and_name_the_rule() -> None:
     until = adding(OPEN)
     further = until(finished(until.request.points()))
     assert [(row_of(each), seed_of(each.overrides)) for each in further] == [

@@ -20,7 +20,7 @@ from tests.sweeps.fakes import until
 from tests.sweeps.servers import mlflow_server, new_database, postgres
 from tests.sweeps.worker.test_lost_drivers import survive
 
-pytestmark = pytest.mark.servers
+pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def test_finish_twice_keeps_first_end(store: TrialStore) -> None:
     assert names.REASON not in trial(store, 0).user_attrs
 
 
-def test_stale_trial_of_list_is_free_again_and_heartbeats_keep_it() -> None:
+def test_heartbeats_keep_a_trial_of_a_list_from_staleness() -> None:
     storage = memory()
     store = store_on(storage)
     for key in "abc":
@@ -157,7 +157,7 @@ def test_point_enqueued_twice_is_run_once(end: str) -> None:
     assert states(b) == ["COMPLETE" if end == "is complete" else "RUNNING"]
 
 
-def test_ask_at_once_for_a_point_enqueued_twice_keeps_one() -> None:
+def test_asking_at_once_for_duplicate_point_keeps_one() -> None:
     storage = memory()
     number, _ = taken(searching(storage))
     a, b = searching(storage), searching(storage)
@@ -178,7 +178,7 @@ def test_ask_at_once_for_a_point_enqueued_twice_keeps_one() -> None:
     assert [each.number for each in a.trials()] == waiting[:1]
 
 
-def test_release_keeps_point_that_another_driver_takes_before_the_end() -> None:
+def test_release_keeps_point_that_another_driver_takes_first() -> None:
     storage = memory()
     number, x = taken(searching(storage), 1)
     slow, fast = searching(storage), searching(storage)
