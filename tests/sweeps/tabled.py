@@ -49,6 +49,7 @@ class FakeResult:
     other_code: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
     folder: Path = Path("nowhere")
+    lists: str = ""
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
         return self.by_path[path]
