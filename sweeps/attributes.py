@@ -5,9 +5,9 @@ KEY = "rgbt.key"  # of its point, see `PlannedPoint.key`
 RUNS = "rgbt.runs"  # keys of its runs, one per seed
 OVERRIDES = "rgbt.overrides"  # of `python -m rgbt.run`, without the seeds of replicates
 LABEL = "rgbt.label"  # the point as shown; written after the first heartbeat
+# Why it failed or was pruned. A failed one without it was lost, released or a duplicate: it does
+# not count.
 REASON = "rgbt.reason"
-"""Why it failed or was pruned. A failed one without it was lost, released or a duplicate: it does
-not count."""
 SECONDS = "rgbt.seconds"  # duration of its runs, all processes together
 RESULTS = "rgbt.results"  # "val/..." and "test/..." scores, mean over its seeds; percent
 PIXELS = "rgbt.pixels"  # size of its images relative to the paper's, which scales ``${px:64}``

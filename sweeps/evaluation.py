@@ -11,11 +11,11 @@ from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
 
+# The head that predicts: that of the domain of each image, or that of one domain for all.
 Head = Literal["as trained", "own", "source", "target"]
-"""The head that predicts: that of the domain of each image, or that of one domain for all."""
 
+# Statistics of batch normalisation, see `rgbt.evaluation.request.BatchNormRequest`.
 BatchNorm = Literal["as trained", "recomputed", "adabn", "batch"]
-"""Statistics of batch normalisation, see `rgbt.evaluation.request.BatchNormRequest`."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ExtraEvaluation:
 
     @property
     def label(self) -> str:
-        """As shown: the name of its counts, "table_rgb_ring5_occluded-0.5"."""
+        """The name of its counts: "table_rgb_ring5_occluded-0.5"."""
         return self.path.rpartition("/")[2].removesuffix(".npz")
 
     @property

@@ -14,8 +14,8 @@ from sweeps.evaluation import ExtraEvaluation
 
 Value = str | int | float | bool | None
 State = Literal["finished", "failed", "running", "waiting", "missing"]
+# States of points that a command runs.
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command runs."""
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,9 @@ from sweeps.worker.run_store import RunStore
 if TYPE_CHECKING:
     from sweeps.reproduce import Options
 
+# Estimated duration of a run as long as no run of its network has finished: that of an arm at
+# bench scale on two cores.
 DEFAULT_S = 240.0
-"""Estimated duration of a run as long as no run of its network has finished: that of an arm at
-bench scale on two cores."""
 
 
 @dataclass

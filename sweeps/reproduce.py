@@ -59,11 +59,11 @@ class Options:
     trust: Trust = ""
 
 
+# Options that are no settings of execution of that name.
 TABLE_OPTIONS = (
     *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
     *("minutes", "archive"),
 )
-"""Options that are no settings of execution of that name."""
 
 
 def main(options: Options, overrides: list[str]) -> int:

@@ -14,10 +14,10 @@ from rgbt.metrics import names as scores
 from rgbt.metrics.scores import MEANS
 from rgbt.ranges import Names, Positive, Text
 
+# Scores that a run measures once, of its best checkpoint.
 FINAL_METRICS = [
     scores.consistency(s, p) for s in (scores.TC, scores.CA) for p in ("aligned", "released")
 ]
-"""Scores that a run measures once, of its best checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Objective:
 
 Gpu = Annotated[int, Interval(ge=0, le=1023)]
 
+# The GPU that a worker uses, or several for runs with `trainer.devices`.
 GpuSlot = Gpu | Annotated[tuple[Gpu, ...], Len(1, 64)]
-"""The GPU that a worker uses, or several for runs with `trainer.devices`."""
 
 NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
@@ -87,8 +87,8 @@ class SweepSettings:
     trust: Annotated[str, Len(0, 4096)]
 
 
+# Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for.
 UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}
-"""Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for."""
 
 
 def read_settings(node: DictConfig) -> SweepSettings:

@@ -30,8 +30,8 @@ from rgbt.config.values import check_value
 from sweeps.point import Point, Value
 
 Distribution = kinds.FloatDistribution | kinds.IntDistribution | kinds.CategoricalDistribution
+# Key of the configuration (dotted, or a group such as ``loss``) -> what Optuna samples.
 Space = Mapping[str, Distribution]
-"""Key of the configuration (dotted, or a group such as ``loss``) -> what Optuna samples."""
 
 
 def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
@@ -208,9 +208,9 @@ def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
     return Point("", (*fixed, *own), params)
 
 
+# Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
+# stop the study, which neither several drivers nor a resumed search can share.
 SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
-"""Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
-stop the study, which neither several drivers nor a resumed search can share."""
 
 
 def _of_trial(name: str) -> Any:

@@ -31,14 +31,14 @@ WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
 WORDS |= {"RUNNING": "running", "WAITING": "waiting"}
 """Optuna's states as shown."""
 
+# Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
-"""Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth."""
 
+# Rows of the tables of best trials, and of points of a grid or list; the CSV has all.
 TOP, POINTS = 10, 50
-"""Rows of the tables of best trials, and of points of a grid or list; the CSV has all."""
 
+# Scores that are shown also where they are no objective.
 ALWAYS = (metric_names.MIOU, metric_names.VAR)
-"""Scores that are shown also where they are no objective."""
 
 
 @dataclass(frozen=True)

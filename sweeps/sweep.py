@@ -37,8 +37,8 @@ from sweeps.worker.run_store import RunStore, open_run_store
 from sweeps.worker.storage import TrialStore, counted_trials, known_studies
 from sweeps.worker.trial_sources import SamplerSource
 
+# Beginnings of overrides that may differ between two calls of the same sweep.
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
-"""Beginnings of overrides that may differ between two calls of the same sweep."""
 
 
 def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:

@@ -31,13 +31,13 @@ from sweeps.worker.run_store import RunStore, open_run_store
 if TYPE_CHECKING:
     from sweeps.reproduce import Options
 
+# Nodes of the configuration that no override may change.
 ROW_SETTINGS = {
     "seed": "the rows set it; choose seeds=3.",
     "experiment": "the rows set it; choose another table.",
     "metric": "the columns define what is counted; set `regions` in your own table.",
     "consistency": "the columns define what is counted; see rgbt consistency run=...",
 }
-"""Nodes of the configuration that no override may change."""
 
 
 def read_named(name: str) -> tuple[str, Table]:

@@ -22,17 +22,18 @@ NOTES = (
     "2.5 % are called holding. With seeds far from normal (lognormal, sd 1 of the logarithm) 14 to "
     "18 % of verdicts about no difference are wrong.",
 )
+# In the column of seeds: the difference of two evaluations without seeds.
 IMAGES = "images alone"
-"""In the column of seeds: the difference of two evaluations without seeds."""
 
 ALWAYS = (
     *("table", "paper", "claim", "source", "says", "remarks", "verdict", "contrast"),
     *("printed", "as_printed", "margin", "missing", "reason", "how"),
 )
 NUMBERS = ("estimate", "low", "high", "smallest", "seeds_needed")
+# Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
-"""Claims that differ in one of these are never in one grid."""
 
+# Of a claim without a verdict.
 WITHOUT: dict[str, Any] = {
     **dict.fromkeys(NUMBERS, math.nan),
     **{
@@ -45,7 +46,6 @@ WITHOUT: dict[str, Any] = {
         "start": "",
     },
 }
-"""Of a claim without a verdict."""
 
 
 def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:

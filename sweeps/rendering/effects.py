@@ -34,11 +34,11 @@ NOTES = (
     "shown: differs from 0 at the 5 % level, corrected for the number of main effects, or of "
     "interactions, of the method (Holm). The intervals are not corrected.",
 )
+# Of Okabe and Ito, which colour-blind eyes tell apart; methods in their order.
 COLOURS = ("#000000", "#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9")
-"""Of Okabe and Ito, which colour-blind eyes tell apart; methods in their order."""
 
+# Part of the height of a row over which the methods are spread.
 SPAN = 0.62
-"""Part of the height of a row over which the methods are spread."""
 
 
 def effects_grids(effects: Effects, design: Design) -> list[TextTable]:

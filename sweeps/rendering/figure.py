@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Blue and vermilion of Okabe and Ito, which colour-blind eyes tell apart.
 OURS, PUBLISHED = "#0072B2", "#D55E00"
-"""Blue and vermilion of Okabe and Ito, which colour-blind eyes tell apart."""
 
+# Two sets of values get an axis each where the gap between them is this many times their range.
 FAR_APART = 2.0
-"""Two sets of values get an axis each where the gap between them is this many times their range."""
 
+# Columns of a table without headlines, and headlines, that are shown.
 MAX_PANELS, MAX_HEADLINES = 4, 5
-"""Columns of a table without headlines, and headlines, that are shown."""
 
+# Shift of published markers below ours, in rows.
 SHIFT = 0.13
-"""Shift of published markers below ours, in rows."""
 
 
 def write_figure(figure: Figure, path: Path) -> Path:

@@ -24,17 +24,17 @@ from sweeps.table.table import Column, Form, Row
 
 DOUBTFUL = "The printed value does not agree with the others of its row."
 NOT_PRINTED = "Not in the paper."
+# Of every scale but "paper".
 SMALL = (
     "scale={scale}: data and network are small; compare the verdicts of the claims with the paper, "
     "not the values."
 )
-"""Of every scale but "paper"."""
 
+# Of tables that say nothing about their forms.
 FORMS: dict[Form, str] = {
     "paper": "Form: every row is run as the text of the paper describes it.",
     "released": "Form: no row of this table has a released form that differs from the text.",
 }
-"""Of tables that say nothing about their forms."""
 COUNTED = f"Parameters are those of the networks at scale={SCALE}, without discriminators."
 CSV_HEADER = (
     *("table", "row", "column", "mean", "sd", "n", "published", "difference", "reason", "runs"),

@@ -17,8 +17,8 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from sweeps.report.pages import Report
 
+# Remarks that are printed to stderr; the page has all.
 MAX_REMARKS = 5
-"""Remarks that are printed to stderr; the page has all."""
 
 
 @dataclass(frozen=True)

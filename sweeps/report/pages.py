@@ -42,22 +42,22 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).with_name("templates")
 STUDIES = "studies"
+# In the order in which a verdict counts more.
 SCALES = ("smoke", "demo", "bench", "paper")
-"""In the order in which a verdict counts more."""
 
+# A path from the root of a machine; addresses of pages and relative paths do not match.
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
-"""A path from the root of a machine; addresses of pages and relative paths do not match."""
 
+# What is no markup of ours, such as an element in a text of a run.
 MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
-"""What is no markup of ours, such as an element in a text of a run."""
 
+# Numbers in a page written by hand, between two comments.
 MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL)
-"""Numbers in a page written by hand, between two comments."""
 
 FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
+# What a record that somebody has edited may raise.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
-"""What a record that somebody has edited may raise."""
 
 
 class TableView:
@@ -201,7 +201,7 @@ class Report:
         return {"runs": grids, "origin": markdown(TextTable("", ("what", "value"), origin))}
 
     def _scores(self, run: RunResult) -> dict[str, Any]:
-        """Of a run: what it is, its seed, scores, time and tables."""
+        """One line for each group of runs: its seeds, scores, time and tables."""
         tags, stored = run.tags, self.source.stored
         counts, basis = stored.counts(run, OWN_COUNTS), stored.basis([run])
         return {

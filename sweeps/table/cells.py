@@ -18,8 +18,8 @@ from sweeps.point import Outcome
 from sweeps.table.table import Column, Form, Row, Table
 
 NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
+# Path, in the run folder, of the counts of the evaluation that every run makes itself.
 OWN_COUNTS = "counts_test.npz"
-"""Path, in the run folder, of the counts of the evaluation that every run makes itself."""
 
 NO_SEED = "-1"  # of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 

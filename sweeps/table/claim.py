@@ -17,8 +17,8 @@ PREVIOUS = "previous"  # In `Claim.against`: the row before in `Claim.rows`
 
 Range = tuple[float, float]
 HIGHER: Range = (0.0, math.inf)
+# Of a difference whose size does not matter.
 LOWER: Range = (-math.inf, 0.0)
-"""Of a difference whose size does not matter."""
 
 STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
 

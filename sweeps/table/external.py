@@ -37,8 +37,8 @@ from sweeps.worker.processes import run_command
 
 FOLDER = "external"  # inside the folder of runs
 NODE_FILE = "of_the_table"  # of conf/dataset and conf/metric, written for the commands
+# Overrides of the user that reach a row with a network of its own; others are for trainings.
 MACHINE = ("data.", "trainer.accelerator=", "trainer.precision=", "trainer.threads=")
-"""Overrides of the user that reach a row with a network of its own; others are for trainings."""
 
 NEEDS_NETWORK = "needs the network: predictions of a folder are of clean images of both cameras"
 NEEDS_PAIRS = (

@@ -23,9 +23,9 @@ TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
 PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
 TAG_LENGTH = 5000
 
+# Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
+# their table must be valid at any time.
 UNTIL_DECIDED = "rgbt.until_decided/"
-"""Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
-their table must be valid at any time."""
 
 
 @dataclass(frozen=True)

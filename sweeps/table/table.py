@@ -21,8 +21,8 @@ from sweeps.table.design import Design
 
 Form = Literal["paper", "released"]  # what a row is run as
 
+# Ending of the label of a row in its released form, beside the row of the paper's form.
 RELEASED = ", released"
-"""Ending of the label of a row in its released form, beside the row of the paper's form."""
 
 HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 NOISE: Mapping[str, Noise] = {"trained": "cells", "tested": "effects"}
 
+# Name of the line that is no effect: the outcome itself.
 MEAN = "mean of all cells"
-"""Name of the line that is no effect: the outcome itself."""
 
 NUMBERS = ("value", "low", "high", "p", "p_holm")
 COLUMNS = (

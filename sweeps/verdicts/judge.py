@@ -39,11 +39,11 @@ from sweeps.table.design import sign_of
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.table.table import Column, Row, Table
 
+# Of the images: enough for a standard error, which is known to 2 % then.
 RESAMPLES = 2_000
-"""Of the images: enough for a standard error, which is known to 2 % then."""
 
+# (label of the row, seed); the seed of a row that was not trained here is `FIXED`.
 CellRunId = tuple[str, int]
-"""(label of the row, seed); the seed of a row that was not trained here is `FIXED`."""
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ class TableResult:
 
     @cached_property
     def effects(self) -> Effects | None:
-        """Of the factors of its design; None where it has none."""
+        """The effects of the factors of its design; None where it has none."""
         return None if self.request.table.design is None else effects_of(self.judge, self.runs)
 
 

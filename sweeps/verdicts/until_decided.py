@@ -15,12 +15,12 @@ from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, contrasts_of
 
+# Seeds of every row before the claims are judged for the first time: with fewer, an interval that
+# is valid at any time is infinite.
 START = 4
-"""Seeds of every row before the claims are judged for the first time: with fewer, an interval that
-is valid at any time is infinite."""
 
+# Seeds after which a claim that would need more than 1,000 of them gets no more.
 HOPELESS = 8
-"""Seeds after which a claim that would need more than 1,000 of them gets no more."""
 
 
 @dataclass

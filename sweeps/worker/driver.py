@@ -32,10 +32,10 @@ from sweeps.worker.running_trial import (
 from sweeps.worker.storage import HEARTBEAT_S, TrialStore
 
 POLL_S = 0.2
+# How often, and how long, a driver tries to reach its storage again.
 PAUSE_S, RECONNECT_S = 5.0, 600.0
-"""How often, and how long, a driver tries to reach its storage again."""
+# Seconds between two searches for trials to claim, after one without result.
 CLAIM_S = 2.0
-"""Seconds between two searches for trials to claim, after one without result."""
 
 
 class TrialSource(Protocol):

@@ -73,8 +73,8 @@ class ListSource:
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}
         self.errors: dict[int, str] = {}
+        # Indices of equal points, by key; the first one is run.
         self._same: dict[str, list[int]] = {}
-        """Indices of equal points, by key; the first one is run."""
         self._forgiven: set[int] | None = None
         self._finished: dict[str, tuple[RunResult, ...]] = {}
         self._seen: set[int | str] = set()  # failed trials whose runs were looked for, and keys

@@ -12,8 +12,8 @@ from rgbt.config.compose import compose
 from rgbt.runs.provenance import code, packages
 from rgbt.runs.source_code import loaded_modules, user_code
 
+# Not imported before: what runs execute as programs, a few lines each, or do not use.
 PROGRAMS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency", "rgbt.api")
-"""Not imported before: what runs execute as programs, a few lines each, or do not use."""
 
 LIBRARIES = (
     *("torch", "hydra", "scipy.optimize", "sweeps.worker.processes"),

@@ -22,8 +22,8 @@ from rgbt.runs.source_code import counted_modules
 
 CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.worker.preload"
 GPUS = "CUDA_VISIBLE_DEVICES"
+# Time between SIGTERM and SIGKILL of a process that is stopped.
 GRACE_S = 20.0
-"""Time between SIGTERM and SIGKILL of a process that is stopped."""
 
 
 class LocalExecutor:
@@ -73,7 +73,7 @@ class LocalJob:
 
 
 def _run_module(words: Sequence[str], variables: Mapping[str, str], log: str, folder: str) -> None:
-    """In the new process: become ``python -m <words>``; Ctrl-C is for the driver alone."""
+    """Become, in the new process, ``python -m <words>``; Ctrl-C is for the driver alone."""
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(variables)

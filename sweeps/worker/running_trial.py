@@ -24,11 +24,11 @@ from sweeps.worker.run_store import RunStore
 
 LOGS = ".logs"  # Folder inside the folder of runs: output of the processes, one file per run
 
+# Gets a line of the selection split; returns why the trial is pruned, or "".
 PruningCallback = Callable[[MetricLine], str]
-"""Gets a line of the selection split; returns why the trial is pruned, or ""."""
 
+# Starts ``python -m <command>`` with its output in a file.
 Start = Callable[[Sequence[str], Path], LocalJob]
-"""Starts ``python -m <command>`` with its output in a file."""
 
 
 class ClaimedTrial(NamedTuple):

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 Opened = TypeVar("Opened")
 
+# Pattern of the name of a study or a table: it is part of MLflow tags.
 NAME = r"[\w\-. :/]+"
-"""Pattern of the name of a study or a table: it is part of MLflow tags."""
 
+# Seconds between two heartbeats of a trial, and without one until it is lost.
 HEARTBEAT_S, STALE_S = 20, 120
-"""Seconds between two heartbeats of a trial, and without one until it is lost."""
 
 ATTEMPTS, PAUSE_S = 5, 0.7
 

@@ -90,7 +90,7 @@ class SamplerSource:
 
 
 def _short(override: str) -> str:
-    """As shown: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
+    """The label of a parameter: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
     key, _, value = override.lstrip("+").partition("=")
     with suppress(ValueError):
         value = f"{float(value):.4g}"
