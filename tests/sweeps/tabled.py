@@ -48,6 +48,7 @@ class FakeResult:
     commit: str | None = "aaaaaaaaaa"
     other_code: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+    lists: str = ""
     folder: Path = Path("nowhere")
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
