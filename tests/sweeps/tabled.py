@@ -48,6 +48,7 @@ class FakeResult:
     commit: str | None = "aaaaaaaaaa"
     other_code: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+    lists: str = ""
     folder: Path = Path("nowhere")
     lists: str = ""
 
