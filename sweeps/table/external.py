@@ -175,7 +175,11 @@ class ExternalRun:
             own = [f"trust={trust}"] if trust and self.given.kind == "weights" else []
             with searching([f"{SEARCH_PATH}=[{folders}]"]):
                 reason = run_command((*words, *own, f"out={out}"), log)
-            for file in () if reason else sorted(Path(made).glob("*_*.npz")):
+            found = sorted(Path(made).glob("*_*.npz"))
+            if words[0] == "analysis.score":  # it cuts images in three ways
+                metric = self._metric(extra)
+                found = [Path(made, f"counts_{metric.partition}{metric.regions}.npz")]
+            for file in () if reason else found:
                 is_own = file.name.startswith("counts_")
                 target = self.folder / (path if is_own else f"evaluations/{file.name}")
                 target.parent.mkdir(exist_ok=True)
@@ -198,11 +202,16 @@ class ExternalRun:
         plain = ExtraEvaluation(regions=extra.regions)
         if extra not in (plain, replace(plain, modality="rgbt")):
             return (), NEEDS_NETWORK
-        metric = compose([f"metric={extra.regions}"]).metric if not regions else self.config.metric
+        metric = self._metric(extra)
         if metric.get("aspect") == "released_3_4":
             return (), f"predictions are not counted in regions {extra.regions}; choose ring5"
-        shape = (f"partition={metric.partition}", f"regions={metric.regions}")
-        return ("analysis.score", "resamples=0", *shape, *of_folder), ""
+        return ("analysis.score", "resamples=0", f"regions={metric.regions}", *of_folder), ""
+
+    def _metric(self, extra: ExtraEvaluation) -> Any:
+        """The node of the configuration that says how an evaluation cuts images into regions."""
+        if extra.regions == "as trained":
+            return self.config.metric
+        return compose([f"metric={extra.regions}"]).metric
 
 
 def content_hash(path: Path) -> str:

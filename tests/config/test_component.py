@@ -68,7 +68,7 @@ def test_node_is_built_with_converted_values_and_offered_objects() -> None:
     offered = object()
     knob = build(node, model=offered, unused=1)
     assert (knob.size, knob.kind, knob.model) == ((3, 4), "a", offered)
-    assert (knob.inner.size, knob.inner.kind, knob.inner.model) == ((3, 4), "b", None)
+    assert (knob.inner.size, knob.inner.kind, knob.inner.model) == ((3, 4), "b", offered)
     with pytest.raises(InputError, match="'knob.size' has no value"):
         build(OmegaConf.create({"knob": {"_target_": f"{__name__}.Knob", "kind": "a"}}).knob)
 

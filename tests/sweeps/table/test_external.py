@@ -152,7 +152,7 @@ def test_predictions_have_the_counts_of_rgbt_score(
     (result,) = run["CMNeXt"].results
     file = "ring5" if regions == "as trained" else regions
     words = (f"predictions={predictions}", "dataset=mfnet", f"dataset.root={data}")
-    shape = (f"partition={file[:-1]}", f"regions={file[-1]}", "resamples=0")
+    shape = (f"regions={file[-1]}", "resamples=0")
     assert call(score_command.entry, *words, *shape, f"out={tmp_path / 'out'}")[0] == 0
     expected = Counts.load(tmp_path / "out" / f"counts_{file}.npz")
     own = regions == "as trained"
