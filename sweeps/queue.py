@@ -57,10 +57,9 @@ class Queue:
         self.owners = [n for n, plan in enumerate(self.plans) for _ in plan.points.points]
 
     def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
-        """The next seeds of open claims; adds new finished runs to the archive.
+        """The next seeds of open claims, given all points in their order.
 
-        Args:
-            outcomes: of all points until now, in their order.
+        It adds new finished runs to the archive.
         """
         finished = {n for n, outcome in enumerate(outcomes) if outcome.state == "finished"}
         for outcome in (outcomes[place] for place in finished - self._seen):

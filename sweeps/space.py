@@ -114,7 +114,7 @@ SweptValues = dict[str, list[str]]  # Key -> values of an override, as they stan
 
 
 def split(
-    overrides: Iterable[str], config_loader: ConfigLoader
+    overrides: Iterable[str], config_loader: ConfigLoader | None = None
 ) -> tuple[tuple[str, ...], SweptValues, dict[str, dict[str, Any]]]:
     """Split the overrides of ``-m`` into single values, lists of values, and ranges.
 

@@ -20,7 +20,7 @@ from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics import names as metric_names
-from rgbt.tables import ABSENT, TextTable, csv_text
+from rgbt.tables import ABSENT, TextTable
 from sweeps import attributes as names
 
 if TYPE_CHECKING:
@@ -222,8 +222,7 @@ def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) ->
 
 def trials_csv(data: StudyData) -> str:
     """All trials that count, one line each, numbers in full."""
-    frame = data.frame.drop(columns="key")
-    return csv_text([list(frame), *frame.fillna("").to_numpy().tolist()])
+    return str(data.frame.drop(columns="key").to_csv(index=False))
 
 
 def publish_study(study: optuna.Study, out: Path, url: str) -> None:

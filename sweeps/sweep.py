@@ -166,12 +166,9 @@ def search(request: Search, settings: SweepSettings) -> None:
     if settings.dry_run:
         known = known_studies(settings.storage, runs_dir).get(request.study)
         done = 0 if known is None else len(counted_trials(known))
-        lines = [
-            *(f"{key}: {one}" for key, one in request.space.items()),
-            *(f"{objective.direction} {objective.metric}" for objective in settings.objectives),
-            f"study {request.study}: {done} of {settings.trials or 'any number of'} trials exist.",
-        ]
-        sys.stdout.write("\n".join([*lines, ""]))
+        space = "".join(f"{key}: {one}\n" for key, one in request.space.items())
+        total = settings.trials or "any number of"
+        sys.stdout.write(f"{space}study {request.study}: {done} of {total} trials exist.\n")
         return
     dataset = probe(request, settings).dataset
     storage = stores.open_storage(settings.storage, runs_dir)

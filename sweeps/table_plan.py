@@ -60,17 +60,13 @@ def check_override(word: str) -> None:
 def select_rows(table: Table, text: str) -> Table:
     """The table with the rows of ``rows=A,H`` alone, and with the claims about them.
 
-    A row is named by its label or its number, several by the name of their group (`Row.group`).
+    A row is named by its label or its number (labels with commas: by the number), several by the
+    name of their group (`Row.group`).
     """
-    labels, words = [row.label for row in table.rows], split_list(text, "rows")
     chosen: set[str] = set()
-    while words:  # a label may contain commas
-        ends = range(len(words), 1, -1)
-        end = next((each for each in ends if ", ".join(words[:each]) in labels), 1)
-        word = ", ".join(words[:end])
+    for word in split_list(text, "rows"):
         group = {row.label for row in table.rows if row.group == word}
         chosen |= group or {row_named(word, table).label}
-        del words[:end]
     first, origin, rows = dict[str, str](), _origins(table), list[Row]()
     for row in table.rows:
         if row.label in chosen:

@@ -34,9 +34,6 @@ NOTES = (
     "shown: differs from 0 at the 5 % level, corrected for the number of main effects, or of "
     "interactions, of the method (Holm). The intervals are not corrected.",
 )
-# Of Okabe and Ito, which colour-blind eyes tell apart; methods in their order.
-COLOURS = ("#000000", "#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9")
-
 # Part of the height of a row over which the methods are spread.
 SPAN = 0.62
 
@@ -95,12 +92,14 @@ def effects_figure(effects: Effects, name: str) -> Figure | None:
 
 def _panel(axes: Axes, lines: pd.DataFrame, methods: list[str]) -> None:
     """Effects below each other; the methods of an effect close together."""
+    from analysis.figures.plots import series_style
+
     effects = list(lines["effect"].unique())
     for place, method in enumerate(methods):
         own = lines[lines["method"] == method]
         shift = SPAN * ((place + 0.5) / len(methods) - 0.5)
         at = [effects.index(each) + shift for each in own["effect"]]
-        colour = COLOURS[place % len(COLOURS)]
+        colour = series_style(place)["color"]
         halves = (own["high"] - own["low"]) / 2
         faces = [colour if each in ("higher", "lower") else "white" for each in own["shown"]]
         axes.errorbar(

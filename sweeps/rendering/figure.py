@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,15 +13,11 @@ from sweeps.table.efficiency import SCALE
 from sweeps.table.table import Column
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Blue and vermilion of Okabe and Ito, which colour-blind eyes tell apart.
 OURS, PUBLISHED = "#0072B2", "#D55E00"
-
-# Two sets of values get an axis each where the gap between them is this many times their range.
-FAR_APART = 2.0
+DOTS: dict[str, Any] = {"fmt": "o", "ms": 5, "lw": 1, "capsize": 3, "ls": "none"}
 
 # Columns of a table without headlines, and headlines, that are shown.
 MAX_PANELS, MAX_HEADLINES = 4, 5
@@ -31,22 +26,9 @@ MAX_PANELS, MAX_HEADLINES = 4, 5
 SHIFT = 0.13
 
 
-def write_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG or SVG; equal figures give equal bytes."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {"Date": None} if path.suffix == ".svg" else {}
-    with mpl.rc_context({"svg.hashsalt": "rgbt", "svg.fonttype": "none"}):
-        figure.savefig(path, dpi=150, metadata=metadata)
-    return path
-
-
 def figure_of(scored: ScoredTable) -> Figure | None:
     """The figure; None where there is no value at all."""
-    from matplotlib.figure import Figure
+    from analysis.figures.plots import new_figure
 
     rows = scored.table.rows
     values = {column.name: _values(scored, column) for column in scored.table.columns}
@@ -55,13 +37,18 @@ def figure_of(scored: ScoredTable) -> Figure | None:
     shown = shown or columns[:MAX_PANELS]
     if not shown:
         return None
-    size = (max(2.2 + 3.2 * len(shown), 6.4), 1.9 + 0.32 * len(rows))
-    figure = Figure(figsize=size, layout="constrained")
+    figure = new_figure(max(2.2 + 3.2 * len(shown), 6.4), 1.9 + 0.32 * len(rows))
     panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    places = np.arange(len(rows))
     for axes, column in zip(panels, shown, strict=True):
-        _draw(axes, *values[column.name])
+        means, sds, printed = values[column.name]
+        bars = None if np.isnan(sds).all() else sds
+        axes.errorbar(means, places, xerr=bars, **DOTS, color=OURS, label="ours")
+        style = {**DOTS, "color": PUBLISHED, "mfc": "none", "label": "published"}
+        axes.errorbar(printed, places + SHIFT, **style)
         axes.set_xlabel(column.name)
-    panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
+        axes.grid(alpha=0.25)
+    panels[0].set_yticks(places, [row.label for row in rows])
     panels[0].set_ylim(len(rows) - 0.5, -0.5)
     ours = f"ours: counted at scale={SCALE}" if scored.cells else "published"
     if scored.seeds:
@@ -69,12 +56,8 @@ def figure_of(scored: ScoredTable) -> Figure | None:
         spread = f"mean ± sd of {many} seeds" if many > 1 else f"seed {scored.seeds[0]}"
         ours = f"ours: scale={scored.scale}, {spread}"
     figure.suptitle(f"{scored.name} ({ours})", fontsize=10)
-    handles: dict[str, Artist] = {}
-    for axes in figure.axes:
-        artists, labels = axes.get_legend_handles_labels()
-        handles |= dict(zip(labels, artists, strict=True))
-    artists, labels = list(handles.values()), list(handles)
-    figure.legend(artists, labels, loc="outside lower center", ncols=4, fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     return figure
 
 
@@ -85,26 +68,3 @@ def _values(scored: ScoredTable, column: Column) -> Values:
         cell, printed = scored.cells.get((row.label, column.name), nothing), published(row, column)
         found.append((cell.mean, cell.sd, math.nan if printed is None else printed))
     return np.array(found, np.float64).T
-
-
-def _draw(axes: Axes, means: Values, sds: Values, printed: Values) -> None:
-    """Ours and the published values of a column; an axis each where they are far apart."""
-    known = [each[~np.isnan(each)] for each in (means, printed)]
-    other, places = axes, np.arange(len(means))
-    if all(map(len, known)):
-        gap = max(known[0].min() - known[1].max(), known[1].min() - known[0].max())
-        if gap > FAR_APART * max(float(np.ptp(each)) for each in known):
-            other = axes.twiny()
-            axes.tick_params(axis="x", colors=OURS)
-            other.tick_params(axis="x", colors=PUBLISHED)
-            other.spines["top"].set_color(PUBLISHED)
-            other.set_xlabel("published", color=PUBLISHED)
-    style: dict[str, Any] = {"fmt": "o", "ms": 5, "lw": 1, "capsize": 3, "ls": "none"}
-    if len(known[0]):
-        bars = None if np.isnan(sds).all() else sds
-        axes.errorbar(means, places, xerr=bars, **style, color=OURS, label="ours")
-    if len(known[1]):
-        other.errorbar(
-            printed, places + SHIFT, **style, color=PUBLISHED, mfc="none", label="published"
-        )
-    axes.grid(alpha=0.25)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 from rich.console import Group
@@ -18,7 +16,7 @@ from rgbt.terminal import info, path_lines, print_rich, rich_table
 from sweeps.point import Outcome, State
 from sweeps.rendering.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
 from sweeps.rendering.effects import effects_figure, effects_grids
-from sweeps.rendering.figure import figure_of, write_figure
+from sweeps.rendering.figure import figure_of
 from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 from sweeps.table.cells import NO_VALUE
 from sweeps.table.request import TableRequest
@@ -43,14 +41,7 @@ def publish_table(
     external: Mapping[CellRunId, Outcome],
     out: Path,
 ) -> int:
-    """Print the table and its claims, and write its files into `out`.
-
-    Args:
-        judge: of the table.
-        request: the table.
-        outcomes: of its points.
-        external: runs of rows that are not trained.
-        out: folder of the files.
+    """Print the table and its claims, and write its files into `out`; `external` are not trained.
 
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
@@ -76,12 +67,14 @@ def publish_table(
         out.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             write_atomic(out / name, text.encode())
-        drawn = drawn_of(result)
-        figures = [] if drawn is None else [write_figure(drawn, out / "figure.png")]
+        if drawn := drawn_of(result):
+            from analysis.figures.plots import save
+
+            save(drawn, out / "figure.png")
     except OSError as error:
         info(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
         return 1
-    files = ", ".join([*texts, *(path.name for path in figures)])
+    files = ", ".join([*texts, *(["figure.png"] if drawn else [])])
     print_rich(path_lines([("files", f"{out}/ ({files})")]))
     return 1 if failed else 0
 
@@ -117,25 +110,16 @@ def drawn_of(result: TableResult) -> Figure | None:
 
 def _report_missing(result: TableResult, outcomes: Sequence[Outcome]) -> bool:
     """Lines on stderr; whether a cell failed or has no value."""
-    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
-    others = [outcome for outcome in outcomes if outcome.state in ("running", "waiting")]
-    empty = any(cell.mark == NO_VALUE for cell in result.scored.cells.values())
-    if failed:
+    states = Counter(outcome.state for outcome in outcomes)
+    if failed := states["failed"]:
         info(
-            f"{len(failed)} of {len(outcomes)} runs failed, see the footnotes; rerun the command "
-            "with retry=failed to retry them."
+            f"{failed} of {len(outcomes)} runs failed, see the footnotes; rerun with retry=failed."
         )
-    if others:
-        info(
-            f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them, or "
-            "they have not started; rerun the command later, or with wait=true."
-        )
-    if empty:
-        info("some cells have no value although all runs are finished; see the footnotes.")
-    other = other_code_line(outcomes)
-    if other:
+    if others := states["running"] + states["waiting"]:
+        info(f"{others} of {len(outcomes)} runs are not finished; rerun the command later.")
+    if other := other_code_line(outcomes):
         info(other)
-    return bool(failed) or empty
+    return failed > 0 or any(cell.mark == NO_VALUE for cell in result.scored.cells.values())
 
 
 def print_preview(plan: TablePlan, outcomes: Sequence[Outcome], workers: int) -> None:
@@ -154,38 +138,12 @@ def print_preview(plan: TablePlan, outcomes: Sequence[Outcome], workers: int) ->
         title = f"{request.name}, scale={request.scale}: runs of the cells"
         header = ("cell", "state", "seconds", "run", "reason")
         print_rich(rich_table(TextTable(title, header, cells)))
-    lines = _summary(request, outcomes, workers)
-    if plan.until_decided is not None:
-        further = len(plan.until_decided.most_runs()) - len(outcomes)
-        seconds = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
-        time = f", {duration(further * median(seconds) / workers)}" if seconds else ""
-        lines.append(
-            f"Until all claims are decided: at most {further} runs more than these{time}; rows of "
-            "decided claims get no more."
-        )
-    print_rich(Text("\n".join(lines)))
-
-
-def _summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:
-    """Sentences below the runs: numbers, time left, further evaluations, what needs no run."""
     states = Counter(outcome.state for outcome in outcomes)
     counted = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
     lines = [f"{len(outcomes)} runs: {counted or 'none'}."]
     if len(outcomes) > states["finished"]:
-        seconds = estimated_seconds(outcomes, workers)
-        known = duration(seconds) if seconds is not None else "known when one run is finished"
-        lines.append(f"Time left with workers={workers}: {known}.")
-    lines += [line for line in (other_code_line(outcomes),) if line]
-    evaluations = request.evaluations() if outcomes else ()
-    words = (shlex.join(each.command) for each in evaluations if not each.world)
-    commands = list(dict.fromkeys(each.replace("rgbt.", "rgbt ", 1) for each in words))
-    worlds = list(dict.fromkeys(each.world for each in evaluations if each.world))
-    if worlds:
-        commands.append(f"rgbt evaluate in {len(worlds)} worlds ({', '.join(worlds)})")
-    trained = sum(outcome.is_trained for outcome in outcomes)
-    if commands:
-        shown = "; ".join(commands)
-        lines.append(f"Evaluations of every run that still lacks them: {shown}.")
-    if commands and trained:
-        lines.append(f"Already trained: {trained}; the time left excludes their evaluations.")
-    return lines
+        left = estimated_seconds(outcomes, workers)
+        known = duration(left) if left is not None else "known when one run is finished"
+        lines.append(f"Time left with workers={workers}, without further evaluations: {known}.")
+    lines += filter(None, [other_code_line(outcomes)])
+    print_rich(Text("\n".join(lines)))

@@ -57,14 +57,7 @@ MARKDOWN = Style(
 def render_table(
     scored: ScoredTable, style: Style, extra: Sequence[str] = (), remarks: Sequence[str] = ()
 ) -> TextTable:
-    """The grid of a table: of every row ours, published and difference.
-
-    Args:
-        scored: the table.
-        style: of the marks.
-        extra: overrides that the user added to every row.
-        remarks: further sentences below it.
-    """
+    """The grid of a table; `extra` are overrides of every row, `remarks` sentences below it."""
     table, builder = scored.table, _Lines(scored, style)
     title = builder.noted(f"{table.paper}, {table.number}: {table.caption}", *table.remarks)
     header = builder.header()

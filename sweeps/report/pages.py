@@ -126,11 +126,7 @@ def claims_of(views: Sequence[TableView]) -> pd.DataFrame:
 class Report:
     """Everything that the pages show, computed once from finished runs.
 
-    Args:
-        source: the tables.
-        runs: the finished runs.
-        studies: name of a study -> its report in Markdown.
-        track: shows the progress of going over something.
+    `studies` maps the name of a study to its report in Markdown; `track` shows progress.
     """
 
     def __init__(
@@ -295,14 +291,14 @@ class Report:
     def _images(self) -> dict[str, bytes]:  # a second drawing has another layout
         import tempfile
 
-        from sweeps.rendering.figure import write_figure
+        from analysis.figures.plots import save
 
         with tempfile.TemporaryDirectory() as folder:
-            return {
-                view.figure: write_figure(view.drawn, Path(folder, view.figure)).read_bytes()
-                for view in self.views
-                if view.drawn is not None
-            }
+            paths = {view.figure: Path(folder, view.figure) for view in self.views if view.drawn}
+            for view in self.views:
+                if view.drawn:
+                    save(view.drawn, paths[view.figure])
+            return {name: path.read_bytes() for name, path in paths.items()}
 
     def filled(self, text: str) -> str:
         """A page written by hand with its marked numbers made again.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import sys
 from collections.abc import Sequence
@@ -52,33 +51,34 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     """
     import yaml
 
+    from rgbt.config.command import composing
     from rgbt.config.compose import PIXELS
     from rgbt.files.atomic import write_atomic
     from sweeps.point import short_names
+    from sweeps.space import grid_points, split
     from sweeps.table.load_table import PUBLISHED
     from sweeps.worker.planner import specify_run
 
     path = folder / f"{name}.yaml"
     if path.exists() or (PUBLISHED / f"{name}.yaml").exists():
         raise InputError(f"table={name} already exists; edit it, or choose another name.")
-    if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
+    if not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
-    values = dict(map(_values, overrides))
-    if wrong := {"seed", "runs_dir"} & set(values):
+    with composing(overrides):
+        fixed, varied, _ = split(overrides)
+    if wrong := {"seed", "runs_dir"} & {word.partition("=")[0] for word in overrides}:
         raise InputError(f"{min(wrong)}=...: choose it when you run the table.")
-    varied = {key: each for key, each in values.items() if len(each) > 1}
     if not varied:
         raise InputError("no key is varied; give a comma list, such as masker.sigma_div=1,2,4.")
     short = {key: name.lstrip("+") for key, name in short_names(varied).items()}
     rows: list[dict[str, Any]] = []
-    for point in itertools.product(*values.values()):
-        chosen = dict(zip(values, point, strict=True))
-        words = [f"{key}={value}" for key, value in chosen.items()]
-        specify_run([f"+experiment={experiment}", *words])
+    for point in grid_points(fixed, varied):
+        specify_run([f"+experiment={experiment}", *point.overrides])
+        words = [word.partition("=") for word in point.overrides]
+        text = " ".join(f"{short[key]}={value}" for key, _, value in words if key in short)
         # Hydra escapes ${px:64} inside a list; which value it has depends on the scale.
-        text = re.sub(r"\\(.)", r"\1", " ".join(f"{short[key]}={chosen[key]}" for key in varied))
-        label = PIXELS.sub(r"\1px", text).replace("'", "")
-        rows.append({"label": label, "experiment": experiment, "overrides": words})
+        label = PIXELS.sub(r"\1px", re.sub(r"\\(.)", r"\1", text)).replace("'", "")
+        rows.append({"label": label, "experiment": experiment, "overrides": list(point.overrides)})
     paper, _, number = name.rpartition("/")
     table: dict[str, Any] = {
         **{"paper": paper or "own", "number": number},
@@ -94,16 +94,3 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, f"{HEAD.format(name=name)}{text}".encode())
     return path
-
-
-def _values(override: str) -> tuple[str, tuple[str, ...]]:
-    """The key of an override, and its values: one, or several to vary."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    from rgbt.config.command import composing
-
-    with composing([override]):
-        parsed = OverridesParser.create().parse_override(override)
-        key, _, value = override.partition("=")
-        is_varied = parsed.is_sweep_override()
-        return key, tuple(parsed.sweep_string_iterator()) if is_varied else (value,)

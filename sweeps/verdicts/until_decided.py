@@ -45,9 +45,7 @@ class SeedsUntilDecided:
         It is the lowest one that some of these rows lack, for each of them. They get it while at
         most one of their seeds is unfinished: no worker is idle, and few runs are made that turn
         out to be unnecessary. Rows of a claim with a failed run get no seeds.
-
-        Args:
-            outcomes: of all points until now.
+        `outcomes` are those of all points until now.
         """
         runs = self.request.runs(outcomes)
         finished = frozenset(each for each, run in runs.items() if run.state == "finished")
@@ -67,16 +65,6 @@ class SeedsUntilDecided:
             wanted |= dict.fromkeys(next(filter(None, lacking), []))
         have = {outcome.point.overrides for outcome in outcomes}
         return [each for each in self.request.points(list(wanted)) if each.overrides not in have]
-
-    def most_runs(self) -> list[Point]:
-        """Every point that may be run: `max_seeds` of rows of claims, `START` of others."""
-        if not self.request.row_seeds():
-            return []
-        named = {label for claim in self.request.table.claims for label in self._trained(claim)}
-        rows = (row.label for row in self.request.trained_rows)
-        most = {label: self.max_seeds if label in named else START for label in rows}
-        pairs = [(label, seed) for label, count in most.items() for seed in range(count)]
-        return self.request.points(pairs)
 
     def _trained(self, claim: Claim) -> list[str]:
         """Labels of the trained rows of a claim."""

@@ -1,4 +1,4 @@
-"""Progress of a driver: a bar of all points with the time left, and one for each running trial.
+"""Progress of a driver: a bar of all points with the time left, over a line per running trial.
 
 Where stderr is no terminal (a log file of a cluster), a line per trial that begins or ends.
 """
@@ -15,7 +15,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -41,11 +40,8 @@ def bars() -> Progress:
 class ProgressView:
     """The progress of a driver; use as a context manager.
 
-    Args:
-        title: e.g. the table.
-        workers: processes at a time.
-        count: returns the number of points done by all drivers, and of all points (None: a search
-            that ends by time); called every few seconds.
+    `count`, called every few seconds, returns the number of points done by all drivers, and of all
+    points (None: a search that ends by time).
     """
 
     def __init__(
@@ -56,7 +52,6 @@ class ProgressView:
         self._counted_at, self._done = -math.inf, 0
         self._bars = bars()
         self._all = self._bars.add_task(title)
-        self._tasks: dict[int, TaskID] = {}
 
     def __enter__(self) -> None:
         self._bars.start()
@@ -84,7 +79,7 @@ class ProgressView:
             self._bars.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def update(self, trials: Sequence[RunningTrial]) -> None:
-        """Draw the running trials."""
+        """Draw the bar, and the running trials below it."""
         if self._bars.disable:
             return
         if time.monotonic() - self._counted_at > 5:
@@ -93,15 +88,13 @@ class ProgressView:
             self._bars.update(self._all, total=total)
         ended = (f", {self._ended[how]} {how}" for how in ("failed", "pruned") if self._ended[how])
         done = self._done + sum(trial.done_share for trial in trials)
-        self._bars.update(self._all, completed=done, description="".join([self._title, *ended]))
-        for number in set(self._tasks) - {trial.number for trial in trials}:
-            self._bars.remove_task(self._tasks.pop(number))
-        for trial in trials:
-            if trial.number not in self._tasks:
-                self._tasks[trial.number] = self._bars.add_task("", total=100)
-            label = without_controls(trial.plan.point.label)
-            text, task = f"  {label}  {trial.status}{_score(trial)}", self._tasks[trial.number]
-            self._bars.update(task, completed=100 * trial.done_share, description=text)
+        labels = [without_controls(trial.plan.point.label) for trial in trials]
+        lines = [
+            f"\n  {label}  {each.status}{_score(each)}  {each.done_share:.0%}"
+            for label, each in zip(labels, trials, strict=True)
+        ]
+        title = "".join([self._title, *ended, *lines])
+        self._bars.update(self._all, completed=done, description=title)
 
 
 def _score(trial: RunningTrial) -> str:

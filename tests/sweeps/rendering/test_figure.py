@@ -8,7 +8,7 @@ from sweeps.rendering.figure import SHIFT, figure_of
 from tests.sweeps.tabled import Made
 
 
-def test_ours_are_above_published_values_on_two_axes() -> None:
+def test_ours_are_above_published_values() -> None:
     figure = figure_of(Made({"a": ((40, 50), 48.0), "b": ((60, 70), None)}).scored())
     (axes,) = figure.axes
     assert axes.get_xlabel() == "acc"
@@ -17,5 +17,3 @@ def test_ours_are_above_published_values_on_two_axes() -> None:
     assert ours[0].get_xydata().tolist() == [[45.0, 0.0], [65.0, 1.0]]
     assert np.array_equal(theirs[0].get_xdata(), [48.0, np.nan], equal_nan=True)
     assert theirs[0].get_ydata()[0] == SHIFT
-    far = figure_of(Made({"a": ((1, 2), 80.0), "b": ((2, 3), 81.0)}).scored())
-    assert [each.get_xlabel() for each in far.axes] == ["acc", "published"]

@@ -18,7 +18,7 @@ def test_one_factor(tmp_path: Path) -> None:
     table = load_table("my/ablation", tmp_path)
     assert path == tmp_path / "my" / "ablation.yaml"
     assert [row.label for row in table.rows] == ["sigma_div=1", "sigma_div=4", "sigma_div=16"]
-    assert table.rows[1].overrides == ("masker.sigma_div=4", "masker.patch_size=32")
+    assert table.rows[1].overrides == ("masker.patch_size=32", "masker.sigma_div=4")
     assert table.rows[1].experiment == "grbm"
     names = [column.name for column in table.columns]
     assert names == ["IoU1", "IoU2", "IoU3", "IoU4", "IoU5", "mIoU", "Var"]

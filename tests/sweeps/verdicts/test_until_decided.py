@@ -94,9 +94,6 @@ def test_rows_of_undecided_claims_get_seeds_up_to_maximum() -> None:
         if each.claim.name == "open"
     )
     assert (judged.word, judged.verdict and judged.verdict.seeds) == ("undecided", MAX)
-    assert len(until.most_runs()) == 3 * MAX + START, "the row without a claim needs no more"
-    most = {each.overrides for each in until.most_runs()}
-    assert {each.point.overrides for each in outcomes} <= most
 
 
 def test_added_points_have_one_seed_and_name_the_rule() -> None:

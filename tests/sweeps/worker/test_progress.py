@@ -61,10 +61,8 @@ def test_progress_in_terminal_draws_bars_and_prints_failures(console: Make) -> N
         probe = Console(file=io.StringIO(), width=160)
         probe.print(view._bars.get_renderable())
         seen = probe.file.getvalue()  # type: ignore[attr-defined]
-        parts = ("table, 2 at a time, 1 failed", "1/4", LABEL, "50/100", "training  val mIoU 45.67")
+        parts = ("table, 2 at a time, 1 failed", "1/4", LABEL, "training  val mIoU 45.67  50%")
         assert all(part in seen for part in parts)
-        view.update([])
-        assert len(view._bars.tasks) == 1
     assert f"failed   {LABEL}  100 s  val mIoU 45.67: a bad day" in text.getvalue()
     assert "finished" not in text.getvalue()
 
