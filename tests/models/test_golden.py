@@ -96,7 +96,7 @@ def arranged_as_crm(net: Any, seen: dict[str, Any], label: str) -> Tensors:
     return found | {f"{label}.{level}": value for level, value in levels}
 
 
-@pytest.mark.parametrize(("name", "size"), recorded(r"crm_swin_([tsb]).*", fast=["crm_swin_t"]))
+@pytest.mark.parametrize(("name", "size"), recorded(r"crm_swin_([tsb]).*", fast=[]))
 @torch.no_grad()
 def test_crm(name: str, size: str) -> None:
     record = golden.load(name)
@@ -215,9 +215,7 @@ def test_cmx(name: str, size: str) -> None:
     check(record, outputs_of_streams(net, record) | {"logits_decoder_eps_1e-3": logits})
 
 
-@pytest.mark.parametrize(
-    ("name", "size"), recorded(r"temporal_cmx_(b\d).*", fast=["temporal_cmx_b2"])
-)
+@pytest.mark.parametrize(("name", "size"), recorded(r"temporal_cmx_(b\d).*", fast=[]))
 def test_temporal(name: str, size: str) -> None:
     record = golden.load(name)
     classes = record.classes("decode_head.linear_pred.bias")
@@ -278,7 +276,7 @@ def test_gradients_of_cmnext(name: str, size: str) -> None:
 # ---- HeatNet, RTFNet, MFNet ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "_"), recorded(r"(heatnet).*", fast=["heatnet"]))
+@pytest.mark.parametrize(("name", "_"), recorded(r"(heatnet).*", fast=[]))
 @torch.no_grad()
 def test_heatnet(name: str, _: str) -> None:
     """And its discriminator."""

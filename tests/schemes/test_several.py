@@ -45,6 +45,7 @@ def assert_same(found: Values, expected: Values) -> None:
         assert not apart.numel() or apart.max() <= TOLERANCE * largest[kind(name)], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_processes_compute_the_step_of_one(name: str) -> None:
     expected = alone()[name]

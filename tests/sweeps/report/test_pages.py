@@ -237,6 +237,7 @@ def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -
     assert "&lt;script&gt;alert(1)" in page
 
 
+@pytest.mark.slow
 def test_archive_gives_same_pages_and_run_changes_them(
     report: Report, place: Path, tmp_path: Path
 ) -> None:
