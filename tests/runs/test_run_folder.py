@@ -141,7 +141,7 @@ def test_lock_of_killed_process_is_freed_despite_forked_child(
         assert is_held(path)
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 30
         while is_held(path) and time.monotonic() < deadline:
             time.sleep(0.05)  # the child may not have reached its first instruction yet
         is_free = not is_held(path)
