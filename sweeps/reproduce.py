@@ -16,8 +16,8 @@ from rgbt.config.common_options import RunsDir, Trust
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
+from sweeps.new_table import NewOptions, new
 from sweeps.settings import SweepSettings
-from sweeps.table.new_table import NewOptions, new
 
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 

@@ -121,6 +121,7 @@ def test_finished_run_shows_its_tables_again(call: Call, data: Path, tmp_path: P
     assert next(line for line in out.splitlines() if "mIoU" in line) in again
 
 
+@pytest.mark.slow
 def test_seeds_decide_losses_and_key(trained: Trained) -> None:
     def run(*words: str) -> tuple[str, list[dict[str, float]]]:
         folder = trained("+experiment=crm", *words, *short(1))
@@ -279,6 +280,7 @@ def scores_by_hand(counts: Counts) -> list[float]:
     return scores
 
 
+@pytest.mark.slow
 def test_run_on_days_and_nights_counts_every_image(trained: Trained) -> None:
     folder = trained(*NIGHT)
     counts = Counts.load(folder / "counts_test.npz")

@@ -111,6 +111,7 @@ def _merged() -> tuple[list[str], dict[str, dict[DetailKind, np.ndarray]]]:
     return list(merged.counts), merged.details
 
 
+@pytest.mark.slow
 def test_processes_together_have_details_of_images_in_order() -> None:
     for names, detailed in run_in_processes(_merged, 2):
         assert names == list(detailed) == list(NAMES)

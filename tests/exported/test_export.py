@@ -72,6 +72,7 @@ def stating(key: str, value: object) -> Callable[[Proto], None]:
     return change
 
 
+@pytest.mark.slow
 def test_predictions_of_the_file_are_those_of_the_run(
     exported: Path, trained: Trained, call: Call, tmp_path: Path
 ) -> None:

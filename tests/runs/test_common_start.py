@@ -107,6 +107,7 @@ def test_other_scales_have_no_start() -> None:
     assert spec_of("crm", "pretrained=null").dependencies == (), "a random start is possible"
 
 
+@pytest.mark.slow
 def test_arms_train_after_their_start(call: Call, tmp_path: Path) -> None:
     smoke = ("+debug=smoke", "trainer.accelerator=cpu", "tracking=none", f"runs_dir={tmp_path}")
     words = ["+experiment=mfnet", "scale=bench", *smoke]

@@ -267,6 +267,7 @@ def test_sync_continues_behind_a_damaged_folder(
         assert code_of(sync.entry, words) == 2
 
 
+@pytest.mark.slow
 def test_a_store_is_contacted_if_it_lacks_something(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,6 +74,7 @@ def test_nothing_is_sent_to_an_address_of_a_folder(
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.slow
 def test_a_slow_server_and_a_pipe_are_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -225,6 +225,7 @@ def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) 
     assert "No run that is tagged with 'my/planted' has the key of a row today." in text
 
 
+@pytest.mark.slow
 def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -> None:
     shutil.copytree(place / "runs", tmp_path / "runs")
     files = sorted((tmp_path / "runs").glob("*/run.json"))

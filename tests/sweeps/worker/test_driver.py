@@ -101,6 +101,7 @@ def test_driver_score_that_is_no_number_fails(tmp_path: Path, score: float | Non
     assert "no test/mIoU that is a number" in reason(desk, 0)
 
 
+@pytest.mark.slow
 def test_driver_timeout_starts_next_trial(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, points(2), only("x=0", hang), timeout_minutes=0.02).run()
     assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
+from sweeps.new_table import write_new
 from sweeps.reproduce import entry
 from sweeps.table.load_table import load_table
-from sweeps.table.new_table import write_new
 from tests.commands import Call, assert_one_sentence
 
 
