@@ -30,13 +30,13 @@ demo: $(VENV)/.ready
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest $(SPREAD) -m "not slow and not docs"
 
-# Some tests start PostgreSQL, which the first call installs where it is missing.
+# TESTS=... selects some. Some tests start PostgreSQL, which the first call installs where it is missing.
 test-all: $(VENV)/.ready
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || { \
 	  echo "PostgreSQL is missing; installing the Debian package"; \
 	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq --no-install-recommends postgresql; \
 	  else sudo apt-get update -qq && sudo apt-get install -y -qq --no-install-recommends postgresql; fi; }
-	$(BIN)/python -m pytest $(SPREAD)
+	$(BIN)/python -m pytest $(SPREAD) $(TESTS)
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
