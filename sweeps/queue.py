@@ -48,7 +48,8 @@ class Queue:
     planner: Planner
     claims: int = 0
     decided: int = 0
-    _worth: Counter[tuple[str, ...]] = field(default_factory=Counter)  # by overrides
+    # By overrides.
+    _worth: dict[tuple[str, ...], float] = field(default_factory=lambda: defaultdict(float))
     _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _seen: set[int] = field(default_factory=set)  # places of finished points
 
@@ -93,7 +94,7 @@ class Queue:
             self.claims += 1
             self.decided += not is_open
             for overrides in needed if is_open else ():
-                self._worth[overrides] += 1 / len(needed)  # type: ignore[assignment]
+                self._worth[overrides] += 1 / len(needed)
 
     def rank(self, point: Point) -> float:
         """Claims a second that a missing run decides, as far as that is known."""

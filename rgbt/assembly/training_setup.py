@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,6 @@ from rgbt.assembly.contracts import (
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
-from rgbt.data.labels import label_pixels
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
@@ -94,16 +93,14 @@ class TrainingSetup:
 
 def _class_pixels(session: Session, domain: Domain) -> NDArray[np.int64]:
     """Pixels of each class in each label of the source's split, (N, K); unlabelled images: 0."""
-    dataset = session.dataset
     if domain.labels != GIVEN:
         raise InputError(
             f"loss.class_weights: expected numbers; weights are computed from labels of the data "
             f"set, but domains.source.labels is {domain.labels}."
         )
-    labels = map(dataset.label, dataset.names(domain.split))
-    empty = np.empty(0, np.uint8)
-    counts = [label_pixels(empty if each is None else each, dataset.num_classes) for each in labels]
-    return np.stack(counts)[:, :-1]
+    from rgbt.data.rare_classes import class_pixels  # most runs count no classes
+
+    return class_pixels(session.dataset, domain.split)
 
 
 def validate(spec: RunSpec) -> None:
@@ -128,7 +125,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
     session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
-    pixels = partial(_class_pixels, session, domains.source)
+    # Read at most once, by the first loss that asks for it.
+    pixels = cache(partial(_class_pixels, session, domains.source))
     built = spec.build("masker", "loss", "optimizer", "schedule", class_pixels=pixels)
     masker, loss = built["masker"], built["loss"]
     checked = CheckedLoss(loss) if is_own(loss) else loss

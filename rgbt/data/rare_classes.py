@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,28 @@ class RareClasses:
         return ", ".join(f"{self.names[n]} {self.probabilities[n]:.3f}" for n in order)
 
 
+def class_pixels(
+    dataset: LabelledDataset, split: str, *, on_error: Literal["raise", "skip"] = "raise"
+) -> PixelCounts:
+    """Pixels of each class in each label of a split as stored, (N, K); unlabelled images: 0.
+
+    A label that cannot be read is an InputError, or counts as none with on_error="skip".
+    """
+
+    def counted(name: str) -> PixelCounts:
+        try:
+            label = dataset.label(name)
+        except InputError:
+            if on_error == "raise":
+                raise
+            label = None
+        label = np.empty(0, np.uint8) if label is None else label
+        return label_pixels(label, dataset.num_classes)[:-1]
+
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        return np.stack(list(pool.map(counted, dataset.names(split))))
+
+
 def count_rare_classes(
     dataset: LabelledDataset, split: str, settings: LoaderSettings
 ) -> RareClasses:
@@ -86,19 +109,7 @@ def count_rare_classes(
     InputError: a label cannot be read (on_error="raise"); a class occurs, but no image has enough
     of it; nothing is labelled.
     """
-
-    def counted(name: str) -> PixelCounts:
-        try:
-            label = dataset.label(name)
-        except InputError:
-            if settings.on_error == "raise":
-                raise
-            label = None
-        label = np.empty(0, np.uint8) if label is None else label
-        return label_pixels(label, dataset.num_classes)[:-1]
-
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        pixels = np.stack(list(pool.map(counted, dataset.names(split))))
+    pixels = class_pixels(dataset, split, on_error=settings.on_error)
     scored = np.array([name not in dataset.unscored for name in dataset.classes])
     classes = np.flatnonzero(scored & pixels.any(0))
     least = settings.min_class_pixels

@@ -21,8 +21,8 @@ from rgbt.types import IGNORE, Batch, Loss, Output
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
 Computed = Literal["enet", "median_frequency", "inverse"]
+# Returns the pixels of each class in each label of the training split, (N, K).
 ClassPixels = Callable[[], NDArray[np.int64]]
-"""Pixels of each class in each label of the training split, (N, K)."""
 
 TINY = torch.finfo(torch.float32).tiny  # divisor where nothing counts, of a sum that is 0
 
@@ -36,6 +36,8 @@ class CrossEntropy:
     `class_weights` are c, one value per class, or how they are computed from the training split
     (`weights_from`); None weighs all classes alike.
     """
+
+    weighs_confidence = True
 
     def __init__(
         self,
@@ -51,7 +53,7 @@ class CrossEntropy:
             setting = f"loss.class_weights={list(class_weights)}"
             required.append(Requirement("dataset", "num_classes", len(class_weights), setting))
         self.class_weights = class_weights
-        self.record = Record(requires=tuple(required), weighs_confidence=True)
+        self.record = Record(requires=tuple(required), weighs_confidence=self.weighs_confidence)
 
     def __call__(
         self,

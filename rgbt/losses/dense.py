@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.losses.cross_entropy import ClassPixels, ClassWeights, Computed, CrossEntropy
+from rgbt.losses.cross_entropy import TINY, ClassPixels, ClassWeights, Computed, CrossEntropy
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative, Power, Share
 from rgbt.requirements import Record, Requirement
@@ -22,14 +22,7 @@ from rgbt.types import IGNORE, Batch, Output
 class PixelLoss(CrossEntropy):
     """The base of losses that change what each pixel costs, or which pixels count."""
 
-    def __init__(
-        self,
-        *,
-        class_weights: ClassWeights | Computed | None,
-        class_pixels: ClassPixels | None = None,
-    ) -> None:
-        super().__init__(class_weights=class_weights, class_pixels=class_pixels)
-        self.record = Record(requires=self.record.requires)  # no confidence of labels
+    weighs_confidence = False
 
     def costs(self, output: Output, label: Tensor) -> Tensor:
         """-log of the probability of the label of each pixel, (B, H, W) float32; 0 where 255."""
@@ -84,7 +77,7 @@ class OhemCrossEntropy(PixelLoss):
             hard = labelled > easy
             hard[labelled.topk(least).indices] = True
             chosen[n] = hard.view_as(label)
-        count = mean_count((weights * chosen).sum()).clamp(min=torch.finfo(torch.float32).tiny)
+        count = mean_count((weights * chosen).sum()).clamp(min=TINY)
         return {"ohem": ((weights * costs * chosen).sum() / count).reshape(1)}
 
 
@@ -113,7 +106,7 @@ class Focal(PixelLoss):
     ) -> dict[str, Tensor]:
         """The part "focal": one value, shape (1,), float32, of `logits` and `label`."""
         costs = self.costs(output, batch.label)
-        rest = (-torch.expm1(-costs)).clamp(min=torch.finfo(torch.float32).tiny)  # 1 - p
+        rest = (-torch.expm1(-costs)).clamp(min=TINY)  # 1 - p
         total = (self.weights(batch.label) * rest**self.gamma * costs).sum()
         count = mean_count((batch.label != IGNORE).sum().float()).clamp(min=1)
         return {"focal": (total / count).reshape(1)}

@@ -294,11 +294,10 @@ class Report:
         from analysis.figures.plots import save
 
         with tempfile.TemporaryDirectory() as folder:
-            paths = {view.figure: Path(folder, view.figure) for view in self.views if view.drawn}
             for view in self.views:
-                if view.drawn:
-                    save(view.drawn, paths[view.figure])
-            return {name: path.read_bytes() for name, path in paths.items()}
+                if view.drawn is not None:
+                    save(view.drawn, Path(folder, view.figure))
+            return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
     def filled(self, text: str) -> str:
         """A page written by hand with its marked numbers made again.
