@@ -57,7 +57,8 @@ def test_installed_commands_run_in_an_empty_folder(tmp_path: Path) -> None:
     # The dependencies of this environment, without its own rgbt: *.pth files are not read there.
     (site,) = (environment / "lib").glob("python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    options = ("--no-deps", "--no-index", "--force-reinstall", "--prefix", environment)
+    # Not --force-reinstall: even with a prefix it removes the rgbt that the tests import.
+    options = ("--no-deps", "--no-index", "--ignore-installed", "--prefix", environment)
     output_of(tmp_path, *pip, "install", *options, wheel)
     python, script = environment / "bin" / "python", environment / "bin" / "rgbt"
     script.write_text(f"#!{python}\n" + script.read_text().partition("\n")[2])
@@ -71,7 +72,8 @@ def test_installed_commands_run_in_an_empty_folder(tmp_path: Path) -> None:
         folder, script, "reproduce", "table=crm/table1", "dry_run=true"
     )
     output_of(folder, script, "report", "out=report")
-    assert (folder / "report" / "index.html").stat().st_size > 100_000
+    page = (folder / "report" / "index.html").read_text()
+    assert all(f"{paper}: " in page for paper in ("crm", "multihead", "spatialseg", "temporal"))
     output_of(folder, script, "figures")
     # The points of a grid are processes of their own.
     grid = ("-m", "+experiment=mfnet", "seed=0,1", "tracking=none")
