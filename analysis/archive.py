@@ -50,16 +50,33 @@ COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
 TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
 
 PROVENANCE = (
-    *("started", "command", "git_commit", "git_dirty", "code", "python", "threads"),
-    *("platform", "cpu", "cpu_usable", "gpus", "cuda"),
+    "started",
+    "command",
+    "git_commit",
+    "git_dirty",
+    "code",
+    "python",
+    "threads",
+    "platform",
+    "cpu",
+    "cpu_usable",
+    "gpus",
+    "cuda",
 )
 # Entries of the provenance, and the packages whose versions are archived. Paths and the name of
 # the machine are of no use elsewhere.
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hydra-core", "optuna")
 
 DAMAGED = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError),
-    *(KeyError, ValueError, TypeError, OSError),
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    KeyError,
+    ValueError,
+    TypeError,
+    OSError,
 )
 
 

@@ -46,7 +46,14 @@ CLEAN, ALL = "clean", "all"
 SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
 # Columns of `score_frame` and `results`.
 COLUMNS = (
-    *("run", "experiment", "group", "seed", "split", "condition", "severity", "partition"),
+    "run",
+    "experiment",
+    "group",
+    "seed",
+    "split",
+    "condition",
+    "severity",
+    "partition",
     *SCORE_COLUMNS,
 )
 

@@ -42,8 +42,18 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
 SOURCE = "source.txt"
 
 COLUMNS = (
-    *("method", "split", "partition", "subset", "images", "region", "class", "metric", "absent"),
-    *("value", "low", "high"),
+    "method",
+    "split",
+    "partition",
+    "subset",
+    "images",
+    "region",
+    "class",
+    "metric",
+    "absent",
+    "value",
+    "low",
+    "high",
 )
 # Means in the tables; the file of scores holds more.
 SHOWN = (names.MIOU, names.MACC, names.VAR)

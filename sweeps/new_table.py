@@ -81,7 +81,8 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         rows.append({"label": label, "experiment": experiment, "overrides": list(point.overrides)})
     paper, _, number = name.rpartition("/")
     table: dict[str, Any] = {
-        **{"paper": paper or "own", "number": number},
+        "paper": paper or "own",
+        "number": number,
         "caption": f"{experiment} with {' and '.join(short.values())} varied.",
         "data": "the data set of each row",
         "columns": [

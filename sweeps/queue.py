@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 
 from analysis.archive import add
 from rgbt.checks import InputError, split_list
+from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps.point import Outcome, Point
 from sweeps.settings import SweepSettings
 from sweeps.table.load_table import study_names, table_names
-from sweeps.table.request import TAG
+from sweeps.table.request import TAG, seed_of
 from sweeps.table_plan import TablePlan, plan_table
 from sweeps.verdicts.judge import contrasts_of
 from sweeps.worker.planner import Planner
@@ -40,7 +41,8 @@ class Queue:
     """The runs of several tables, those that decide most claims a minute first.
 
     A missing run is worth, for every open claim that needs it, one over the number of missing runs
-    of that claim. `claims` and `decided` count claims about scores, see `more`.
+    of that claim, and nothing where its table has runs of its seed by another machine: the same
+    seed is another training there. `claims` and `decided` count claims about scores, see `more`.
     """
 
     plans: Sequence[TablePlan]
@@ -48,6 +50,7 @@ class Queue:
     planner: Planner
     claims: int = 0
     decided: int = 0
+    machine: str = field(default_factory=lambda: machine_name(machine()))
     # By overrides.
     _worth: dict[tuple[str, ...], float] = field(default_factory=lambda: defaultdict(float))
     _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -85,7 +88,16 @@ class Queue:
         """Add what the missing runs of a table are worth; claims on a design need all its rows."""
         request, table = plan.request, plan.request.table
         judged = {each.claim.name: each.word for each in plan.judge.claims(request.runs(outcomes))}
-        rows = {p.overrides: set(p.tags[TAG + request.name].split(" | ")) for p in missing}
+        elsewhere = {
+            seed_of(each.point.overrides)
+            for each in outcomes
+            if any(run.machine not in ("", self.machine) for run in each.results)
+        }
+        rows = {
+            point.overrides: set(point.tags[TAG + request.name].split(" | "))
+            for point in missing
+            if seed_of(point.overrides) not in elsewhere
+        }
         sizes = {column.name for column in table.columns if column.efficiency is not None}
         for claim in (each for each in table.claims if not sizes & set(each.columns)):
             named = {cell.row for each in contrasts_of(claim, table) for cell in each.cells}
@@ -153,7 +165,7 @@ def run_queue(
         raise InputError(f"table={options.table}: none of them can be trained.")
     queue, title = Queue(plans, runs, planner), f"tables {options.scale}"
     points = PointList(
-        *(title, title, "list", queue.points, runs, planner.base), more=queue.more, rank=queue.rank
+        title, title, "list", queue.points, runs, planner.base, more=queue.more, rank=queue.rank
     )
     if options.dry_run:
         outcomes = preview_points(points, settings, planner)

@@ -61,8 +61,17 @@ class Options:
 
 # Options that are no settings of execution of that name.
 TABLE_OPTIONS = (
-    *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
-    *("minutes", "archive"),
+    "table",
+    "seeds",
+    "max_seeds",
+    "scale",
+    "form",
+    "rows",
+    "runs_dir",
+    "out",
+    "fresh",
+    "minutes",
+    "archive",
 )
 
 

@@ -105,7 +105,10 @@ class StudyData:
             }
             params, scores = params | dict.fromkeys(chosen), scores | dict.fromkeys(found)
             of_trial = {
-                **{"trial": trial.number, "state": WORDS[trial.state.name], **chosen, **found},
+                "trial": trial.number,
+                "state": WORDS[trial.state.name],
+                **chosen,
+                **found,
                 "label": notes.get(names.LABEL, f"#{trial.number}"),
                 "seconds": notes.get(names.SECONDS),
                 "last_step": trial.last_step,
@@ -241,7 +244,8 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     command = without_passwords(study.user_attrs.get(names.COMMAND, ""))
     remarks = [f"Importances: {remark}"] if remark else []
     text = [
-        *(f"# Study {study.study_name}", f"Kind: {data.kind}. Objectives: {', '.join(ways)}."),
+        f"# Study {study.study_name}",
+        f"Kind: {data.kind}. Objectives: {', '.join(ways)}.",
         *([f"Created by `{command}`."] if command else []),
         *(grid.to_markdown() for grid in grids),
         *remarks,

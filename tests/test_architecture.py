@@ -56,14 +56,14 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    **{
-        "sweeps.worker": {"sweeps.space"},
-        "sweeps.space": set(),
-        "sweeps.report": {f"sweeps.{e}" for e in ("worker", "table", "verdicts", "rendering")},
-    },
-    **{"sweeps.table": {"sweeps.worker"}, "sweeps.verdicts": {"sweeps.table", "sweeps.worker"}},
+    "sweeps.worker": {"sweeps.space"},
+    "sweeps.space": set(),
+    "sweeps.report": {f"sweeps.{e}" for e in ("worker", "table", "verdicts", "rendering")},
+    "sweeps.table": {"sweeps.worker"},
+    "sweeps.verdicts": {"sweeps.table", "sweeps.worker"},
     "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "verdicts")},
-    **{"analysis.predictions": set(), "analysis.uncertainty": set()},
+    "analysis.predictions": set(),
+    "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},
     "analysis.figures": {f"analysis.{e}" for e in ("statistics", "predictions", "uncertainty")},
 }

@@ -44,8 +44,12 @@ CLASSES = ("background", "car", "person", "bike", "curve")
 def counts(path: Path) -> None:
     Counts(
         counts=RNG.integers(0, 99, (4, 3, 5, 5)),
-        **{"names": tuple("abcd"), "night": (True, False, True, False), "classes": CLASSES},
-        **{"partition": "ring3", "dataset": "0123456789abcdef", "split": "test"},
+        names=tuple("abcd"),
+        night=(True, False, True, False),
+        classes=CLASSES,
+        partition="ring3",
+        dataset="0123456789abcdef",
+        split="test",
         unscored=("curve",),
     ).save(path)
 
@@ -89,10 +93,23 @@ def pseudo(path: Path) -> None:
         (folder / name).mkdir(exist_ok=True)
         make(folder / name / "a.png")
     manifest = {
-        **{"format": FORMAT, "teacher": "0123", "weights": "ab", "network": "cd", "view": None},
-        **{"head": None, "label_map": None, "threshold": 0.9, "dataset": "mfnet"},
-        **{"fingerprint": "0123", "split": "train", "classes": list("abcde"), "images": 1},
-        **{"skipped": [], "kept": 0.5, "mean_confidence": 0.7, "digest": "ef" * 32},
+        "format": FORMAT,
+        "teacher": "0123",
+        "weights": "ab",
+        "network": "cd",
+        "view": None,
+        "head": None,
+        "label_map": None,
+        "threshold": 0.9,
+        "dataset": "mfnet",
+        "fingerprint": "0123",
+        "split": "train",
+        "classes": list("abcde"),
+        "images": 1,
+        "skipped": [],
+        "kept": 0.5,
+        "mean_confidence": 0.7,
+        "digest": "ef" * 32,
         "by_class": {name: {"share": 0.2, "mean_confidence": 0.7} for name in "abcde"},
     }
     (folder / "pseudo_labels.json").write_text(json.dumps(sealed(manifest), indent=1))

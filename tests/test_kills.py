@@ -133,11 +133,10 @@ def check(bench: Bench, place: Path) -> None:
     assert steps == list(range(1, STEPS + 1))
 
 
-@pytest.mark.parametrize("series", range(2))
-def test_killed_at_random_instants(bench: Bench, series: int) -> None:
-    """Six kills each; by the process or its whole group, with workers or without."""
-    draw = random.Random(series)
-    training = Training(bench.root / f"random_{series}", bench.executor, num_workers=series % 2)
+def test_killed_at_random_instants(bench: Bench) -> None:
+    """Six kills; by the process or its whole group, with workers or without."""
+    draw = random.Random(0)
+    training = Training(bench.root / "random", bench.executor)
     inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])
     for _ in range(6):
         job = training.start()

@@ -109,8 +109,12 @@ def normalised() -> dict[str, Any]:
     """Two steps in training mode and one evaluation; gradients averaged over the processes."""
     torch.manual_seed(0)
     net = nn.Sequential(
-        *(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 3, 1)),
-        *(nn.BatchNorm2d(3, momentum=None, affine=False), nn.Flatten(2)),
+        nn.Conv2d(3, 4, 3),
+        nn.BatchNorm2d(4),
+        nn.ReLU(),
+        nn.Conv2d(4, 3, 1),
+        nn.BatchNorm2d(3, momentum=None, affine=False),
+        nn.Flatten(2),
         nn.BatchNorm1d(3, track_running_stats=False),
     ).double()
     names = list(net.state_dict())

@@ -56,7 +56,8 @@ SMALL_SYNTH = (
 ON_DATA = {
     **{name: (NO_PATCH,) for name in ("baseline", "mfnet")},
     **{name: (NO_PATCH,) for name in ("dinov2", "temporal_con_released")},
-    **{"grbm": (), "spatialseg_released": ()},
+    "grbm": (),
+    "spatialseg_released": (),
     "crm_pst900": ("dataset=synth_pst900", *SMALL_SYNTH),
     "spatialseg_kp": ("dataset=synth_kp", *SMALL_SYNTH),
 }
@@ -87,7 +88,8 @@ OWN = (
 FREIBURG = ("dataset.crop=null", "dataset.val_sequences=[seq_04_day]")
 FILES: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "kp": (write_kp, ()),
-    **{"freiburg": (write_freiburg, FREIBURG), "folder": (write_folder, OWN)},
+    "freiburg": (write_freiburg, FREIBURG),
+    "folder": (write_folder, OWN),
 }
 
 

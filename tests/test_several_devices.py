@@ -192,7 +192,9 @@ def test_torchrun_and_srun_train_the_same_run(data: Path, tmp_path: Path) -> Non
     assert_same_run(two.finished(), alone)
     assert two.text.count("IoU by region") == 1
     job = {
-        **{"SLURM_JOB_ID": str(os.getpid()), "SLURM_NODELIST": "127.0.0.1", "SLURM_NODEID": "0"},
+        "SLURM_JOB_ID": str(os.getpid()),
+        "SLURM_NODELIST": "127.0.0.1",
+        "SLURM_NODEID": "0",
         **dict.fromkeys(("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_STEP_NUM_TASKS"), "2"),
     }
     words, srun = settings(data, 4), tmp_path / "srun"

@@ -50,8 +50,14 @@ SUFFIXES = (".pdf", ".svg", ".png")
 # Okabe and Ito's, the strong ones first; grey and olive (Tol) instead of their yellow, which is
 # lost as a thin line on white, and of black, which stands for what is set apart.
 COLOURS = (
-    *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
-    *("#E69F00", "#56B4E9", "#777777", "#999933"),
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#777777",
+    "#999933",
 )
 
 APART = "black"

@@ -137,8 +137,10 @@ def ring_map(regions: Regions, image_hw: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 @figure(
-    *("spatialseg/fig1", "pixel-level IoU and sample occupancy, with centre, edge and mean"),
-    *("dataset", "metric"),
+    "spatialseg/fig1",
+    "pixel-level IoU and sample occupancy, with centre, edge and mean",
+    "dataset",
+    "metric",
 )
 @plots.styled
 def heats(config: Config, given: MapOptions, *, part: inputs.Part = "all") -> Drawn:
@@ -254,8 +256,10 @@ def note_splits(made: Figure, occupancy: str, scores: str) -> None:
 
 
 @figure(
-    *("spatialseg/fig3", "occupancy of each class by region, and the mIoU of a method"),
-    *("dataset", "metric"),
+    "spatialseg/fig3",
+    "occupancy of each class by region, and the mIoU of a method",
+    "dataset",
+    "metric",
     metric="ring9",
 )
 def classes(
@@ -326,8 +330,10 @@ def draw_classes(frame: pd.DataFrame, regions: str) -> Figure:
 
 
 @figure(
-    *("spatialseg/fig4", "the regions, numbered, over a heat map or an image"),
-    *("dataset", "metric"),
+    "spatialseg/fig4",
+    "the regions, numbered, over a heat map or an image",
+    "dataset",
+    "metric",
     metric="ring9",
 )
 @plots.styled
@@ -356,8 +362,10 @@ def regions(config: Config, given: MapOptions, *, names: inputs.Names = "") -> D
 
 
 @figure(
-    *("spatialseg/fig5", "Laplacian variance by region: RGB and thermal, all, day, night"),
-    *("dataset", "metric"),
+    "spatialseg/fig5",
+    "Laplacian variance by region: RGB and thermal, all, day, night",
+    "dataset",
+    "metric",
     metric="ring9",
 )
 def laplacian(config: Config, given: StatisticsOptions) -> Drawn:
@@ -368,8 +376,10 @@ def laplacian(config: Config, given: StatisticsOptions) -> Drawn:
 
 
 @figure(
-    *("spatialseg/fig6", "signal-to-noise ratio by region: RGB and thermal, all, day, night"),
-    *("dataset", "metric"),
+    "spatialseg/fig6",
+    "signal-to-noise ratio by region: RGB and thermal, all, day, night",
+    "dataset",
+    "metric",
     metric="ring9",
 )
 def snr(

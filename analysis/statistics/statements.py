@@ -41,13 +41,29 @@ RANGES = {
 
 
 COLUMNS = [
-    *("key", "place", "statement", "estimator", "average", "verdict"),
-    *("contrast", "value", "low", "high", "wanted", "finding", "blocks"),
+    "key",
+    "place",
+    "statement",
+    "estimator",
+    "average",
+    "verdict",
+    "contrast",
+    "value",
+    "low",
+    "high",
+    "wanted",
+    "finding",
+    "blocks",
 ]
 # Contrasts that need rings, two of them or more.
 NEEDS_CENTRE = (
-    *("falls", "central", "central_except", "even"),
-    *("centre_edge", "centre_edge_by_part", "centre_less_edge"),
+    "falls",
+    "central",
+    "central_except",
+    "even",
+    "centre_edge",
+    "centre_edge_by_part",
+    "centre_less_edge",
 )
 
 

@@ -260,9 +260,13 @@ def kind_of(annotation: Any) -> str:
 
 
 BOUNDS = {
-    **{"minimum": "from {}", "exclusiveMinimum": "above {}"},
-    **{"maximum": "to {}", "exclusiveMaximum": "below {}", "multipleOf": "in steps of {}"},
-    **{"minItems": "of at least {}", "maxItems": "of at most {}"},
+    "minimum": "from {}",
+    "exclusiveMinimum": "above {}",
+    "maximum": "to {}",
+    "exclusiveMaximum": "below {}",
+    "multipleOf": "in steps of {}",
+    "minItems": "of at least {}",
+    "maxItems": "of at most {}",
 }
 
 

@@ -31,7 +31,12 @@ def external_page() -> str:
         "## Repositories",
         table(
             [
-                *("`model=external/`", "Network", "Published", "Lists", "Repository", "Commit"),
+                "`model=external/`",
+                "Network",
+                "Published",
+                "Lists",
+                "Repository",
+                "Commit",
                 "Licence",
             ],
             [_origin(each) for each in files],
@@ -67,8 +72,13 @@ def _origin(file: ConfigFile) -> list[str]:
     name = stated["repository"]
     link = f"[{name if len(name) < 50 else f'{name[:47]}...'}](https://github.com/{name})"
     return [
-        *(code(file.name), stated["what"].rstrip("."), stated["published"] or "-"),
-        *(stated["lists"], link, stated["commit"], stated["licence"]),
+        code(file.name),
+        stated["what"].rstrip("."),
+        stated["published"] or "-",
+        stated["lists"],
+        link,
+        stated["commit"],
+        stated["licence"],
     ]
 
 
@@ -83,7 +93,10 @@ def _call(file: ConfigFile) -> list[str]:
         f"resized to {size[0]} x {size[1]}" if size else f"multiples of {keys.get('multiple', 1)}"
     )
     return [
-        *(code(file.name), code(keys["constructor"]), code(keys["feed"])),
-        *(f"{inputs}, {changed}" if changed else inputs, sizes),
+        code(file.name),
+        code(keys["constructor"]),
+        code(keys["feed"]),
+        f"{inputs}, {changed}" if changed else inputs,
+        sizes,
         code(str(keys.get("scores", [[]]))),
     ]

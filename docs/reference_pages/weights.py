@@ -26,8 +26,11 @@ def weights_page() -> str:
             ["File", "Architecture, pretraining", "Published at", "`model=`", "Digest"],
             [
                 [
-                    *(code(start.file), start.trained_on, start.origin),
-                    *(", ".join(map(code, start.models)), code(start.digest) or "not stated"),
+                    code(start.file),
+                    start.trained_on,
+                    start.origin,
+                    ", ".join(map(code, start.models)),
+                    code(start.digest) or "not stated",
                 ]
                 for start in STARTS
             ],

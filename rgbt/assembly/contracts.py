@@ -37,8 +37,14 @@ MEMBERS: dict[str, tuple[tuple[str, ...], Calls]] = {
     "dataset": (
         DATASET,
         {
-            **{"has": ("split",), "names": ("split",), "read": ("name",), "label": ("name",)},
-            **{"files": ("name",), "nights": ("names",), "fingerprint": (), "decoding": ()},
+            "has": ("split",),
+            "names": ("split",),
+            "read": ("name",),
+            "label": ("name",),
+            "files": ("name",),
+            "nights": ("names",),
+            "fingerprint": (),
+            "decoding": (),
         },
     ),
     "model": ((), {"forward": ("rgb", "thermal", "masks", "views=", "generator=")}),

@@ -140,9 +140,15 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         scheme: Any = spec.scheme.build(**collaborators, dataset=session.dataset)
     check_part("scheme", scheme)
     components = {
-        **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
-        **{"masker": masker, "transform": session.transform, "data": loading},
-        **{"dataset": session.dataset, "consistency": session.consistency},
+        "scheme": scheme,
+        "loss": loss,
+        "domains": domains,
+        "model": session.model,
+        "masker": masker,
+        "transform": session.transform,
+        "data": loading,
+        "dataset": session.dataset,
+        "consistency": session.consistency,
         WEIGHTS: SimpleNamespace(
             record=Record(pretrained=spec.model.plain.get("weights") is not None)
         ),

@@ -47,13 +47,20 @@ OMEGACONF_NODES = ("Any", "Integer", "Float", "String", "Boolean", "Path", "Byte
 # Classes of settings: an object is a dictionary, its attributes are those of the dictionary.
 SETTINGS = (
     *(f"{module}.CfgNode" for module in ("detectron2.config", "detectron2.config.config")),
-    *("fvcore.common.CfgNode", "fvcore.common.config.CfgNode", "yacs.config.CfgNode"),
+    "fvcore.common.CfgNode",
+    "fvcore.common.config.CfgNode",
+    "yacs.config.CfgNode",
     *(f"{module}.AttributeDict" for module in ATTRIBUTES),
     *(f"lightning{mark}fabric.utilities.data.AttributeDict" for mark in "_."),
-    *("argparse.Namespace", "types.SimpleNamespace", "easydict.EasyDict", "addict.addict.Dict"),
+    "argparse.Namespace",
+    "types.SimpleNamespace",
+    "easydict.EasyDict",
+    "addict.addict.Dict",
     *(f"mm{part}.Config{kind}" for part in MM for kind in ("", "Dict")),
-    *("omegaconf.dictconfig.DictConfig", "omegaconf.listconfig.ListConfig"),
-    *("omegaconf.base.ContainerMetadata", "omegaconf.base.Metadata"),
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
     *(f"omegaconf.nodes.{kind}Node" for kind in OMEGACONF_NODES),
 )
 
@@ -61,8 +68,11 @@ BUILTINS = ("int", "float", "str", "bool", "list", "dict", "tuple", "frozenset",
 # Entries beside weights that hold no weights.
 IGNORED = (
     *(f"pathlib.{kind}" for kind in ("PosixPath", "PurePosixPath", "WindowsPath")),
-    *("pathlib.PureWindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"),
-    *("collections.defaultdict", "typing.Any"),
+    "pathlib.PureWindowsPath",
+    "pathlib._local.PosixPath",
+    "pathlib._local.WindowsPath",
+    "collections.defaultdict",
+    "typing.Any",
     *(f"{module}.{name}" for module in ("builtins", "__builtin__") for name in BUILTINS),
 )
 
@@ -76,7 +86,9 @@ KNOWN: list[Any] = [
     *((OrderedDict, name) for name in SETTINGS),
     *((_empty, name) for name in IGNORED),
     # Scores beside weights are often NumPy's numbers.
-    *(np.dtype, np.ndarray, *(type(np.dtype(code)) for code in "?bhilqBHILQefd")),
+    np.dtype,
+    np.ndarray,
+    *(type(np.dtype(code)) for code in "?bhilqBHILQefd"),
     *((SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
     *((ARRAY, f"numpy.{core}.multiarray._reconstruct") for core in ("core", "_core")),
 ]
@@ -86,8 +98,16 @@ ADVICE_BEFORE = r"(?s)^.*(WeightsUnpickler error: |trusted source\.)"
 ADVICE_AFTER = "Please |In PyTorch |Check the documentation|Exception raised"
 
 DTYPES = (
-    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
-    *(torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+    torch.bool,
+    torch.uint8,
+    torch.int8,
+    torch.int16,
+    torch.int32,
+    torch.int64,
 )
 
 

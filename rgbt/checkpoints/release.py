@@ -23,8 +23,10 @@ Note = Mapping[str, str]
 # Family -> key under which its releases put the weights ("": at the top), and what is before every
 # name. HeatNet's code loads the file of a PSPNet with no_conf, without discriminators.
 RELEASES = {
-    **{"mask2former": ("state_dict", "network."), "semseg": ("state_dict", "module.")},
-    **{"cmx": ("model", ""), "pspnet": ("", "module.trgb_segnet.")},
+    "mask2former": ("state_dict", "network."),
+    "semseg": ("state_dict", "module."),
+    "cmx": ("model", ""),
+    "pspnet": ("", "module.trgb_segnet."),
     **dict.fromkeys(("cmnext", "rtfnet", "mfnet", "external"), ("", "")),
 }
 

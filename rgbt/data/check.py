@@ -80,7 +80,8 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
     """Numbers of names and sizes by split; percent of pixels and number of images by class."""
     rows = [
         (
-            *(split, *map(str, (r.names, r.read, r.day, r.night, r.mirrored, r.unlabelled))),
+            split,
+            *map(str, (r.names, r.read, r.day, r.night, r.mirrored, r.unlabelled)),
             ", ".join(f"{h}x{w} ({number})" for (h, w), number in sorted(r.sizes.items())),
         )
         for split, r in report.splits.items()

@@ -34,8 +34,17 @@ LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
 # Exceptions of Pillow for damaged files.
 UNREADABLE = (
-    *(OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error, zlib.error),
-    *(TypeError, KeyError, IndexError, Image.DecompressionBombError),
+    OSError,
+    ValueError,
+    SyntaxError,
+    EOFError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+    TypeError,
+    KeyError,
+    IndexError,
+    Image.DecompressionBombError,
 )
 
 

@@ -20,13 +20,36 @@ from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
 
 CLASSES = (
-    *("road", "sidewalk", "building", "curb", "fence", "pole", "vegetation", "terrain", "sky"),
-    *("person", "car", "bicycle", "background", "ignore"),
+    "road",
+    "sidewalk",
+    "building",
+    "curb",
+    "fence",
+    "pole",
+    "vegetation",
+    "terrain",
+    "sky",
+    "person",
+    "car",
+    "bicycle",
+    "background",
+    "ignore",
 )
 PALETTE = (
-    *((128, 64, 128), (244, 35, 232), (70, 70, 70), (196, 196, 196), (190, 153, 153)),
-    *((153, 153, 153), (107, 142, 35), (152, 251, 152), (70, 130, 180), (220, 20, 60)),
-    *((0, 0, 142), (119, 11, 32), (138, 43, 226), (0, 0, 0)),
+    (128, 64, 128),
+    (244, 35, 232),
+    (70, 70, 70),
+    (196, 196, 196),
+    (190, 153, 153),
+    (153, 153, 153),
+    (107, 142, 35),
+    (152, 251, 152),
+    (70, 130, 180),
+    (220, 20, 60),
+    (0, 0, 142),
+    (119, 11, 32),
+    (138, 43, 226),
+    (0, 0, 0),
 )
 TRAIN = tuple(
     f"train/{{sequence}}/{{piece}}/{kind}/{kind}_{{stamp}}.png"

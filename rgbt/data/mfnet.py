@@ -20,12 +20,26 @@ from rgbt.ranges import Colour, Names, NumClasses, Text
 Layout = Literal["packed", "folders"]
 
 CLASSES = (
-    *("unlabeled", "car", "person", "bike", "curve"),
-    *("car_stop", "guardrail", "color_cone", "bump"),
+    "unlabeled",
+    "car",
+    "person",
+    "bike",
+    "curve",
+    "car_stop",
+    "guardrail",
+    "color_cone",
+    "bump",
 )
 PALETTE = (
-    *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
-    *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
+    (0, 0, 0),
+    (64, 0, 128),
+    (64, 64, 0),
+    (0, 128, 192),
+    (0, 0, 192),
+    (128, 128, 0),
+    (64, 64, 128),
+    (192, 128, 128),
+    (192, 64, 0),
 )
 LAYOUTS: dict[Layout, tuple[str, str, str]] = {
     "packed": ("images/{name}.png", "images/{name}.png", "labels/{name}.png"),

@@ -18,8 +18,13 @@ Precision = Literal["32-true", "bf16-mixed"]
 
 # Settings of the training loop that do not change the result.
 MACHINE_SETTINGS = (
-    *("accelerator", "log_every", "checkpoint_every", "devices"),
-    *("activation_checkpointing", "memory_format", "compile"),
+    "accelerator",
+    "log_every",
+    "checkpoint_every",
+    "devices",
+    "activation_checkpointing",
+    "memory_format",
+    "compile",
 )
 
 

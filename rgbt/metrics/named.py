@@ -43,7 +43,9 @@ SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
     "triples": (names.FLICKER,),
 }
 CLASS_SCORES: dict[str, ByClass] = {
-    **{"IoU": scores.iou, "acc": scores.recall, names.DISTANCE: scores.iou},
+    "IoU": scores.iou,
+    "acc": scores.recall,
+    names.DISTANCE: scores.iou,
     **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.boundary_iou),
     names.SIZE: lambda counts, _: scores.object_recall(counts),
 }

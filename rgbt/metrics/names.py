@@ -43,8 +43,16 @@ consistency = "{}/{}".format  # TC or CA by protocol; under "released" CA is tha
 by_head = "{}_head/{}".format  # as one of two heads predicts: "source_head/night/mIoU"
 
 FRACTIONS = {
-    *(MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE),
-    *(WARPING_ERROR, FLICKER),
+    MIOU,
+    MACC,
+    MPRECISION,
+    MF1,
+    PIXEL_ACCURACY,
+    BOUNDARY_MIOU,
+    BOUNDARY_IOU,
+    ECE,
+    WARPING_ERROR,
+    FLICKER,
 }
 
 

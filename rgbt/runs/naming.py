@@ -26,8 +26,15 @@ VARIED = "rgbt.varied"
 VALUE_LENGTH = 32
 
 SILENT = (
-    *("experiment", "search", "runs_dir", "tracking", "dataset.root", "model.checkout", "name"),
-    *("seed", "fresh"),
+    "experiment",
+    "search",
+    "runs_dir",
+    "tracking",
+    "dataset.root",
+    "model.checkout",
+    "name",
+    "seed",
+    "fresh",
 )
 # Beginnings of overrides that are of no use on another machine.
 MACHINE_OVERRIDES = ("runs_dir=", "tracking", "dataset.root=", "out=", "fresh=", "hydra")

@@ -152,6 +152,11 @@ def machine() -> dict[str, Any]:
     }
 
 
+def machine_name(entry: Mapping[str, Any]) -> str:
+    """The graphics card of a `machine` or of an entry of provenance, else its processor, or ""."""
+    return str((entry.get("gpus") or [entry.get("cpu") or ""])[0])
+
+
 def other_code(folder: Path) -> str | None:
     """Such as "commit abc1234567 of 2026-11-20, now def5678901+", where a run has other code.
 

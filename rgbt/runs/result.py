@@ -20,7 +20,7 @@ from rgbt.runs.folder import (
     read_provenance,
     read_result,
 )
-from rgbt.runs.provenance import commit_of, other_code
+from rgbt.runs.provenance import commit_of, machine_name, other_code
 
 # The checkpoint of evaluations, and the pattern of the counts that a run ended with.
 CHECKPOINT, ALL_COUNTS = "best.pt", "counts_*.npz"
@@ -82,6 +82,11 @@ class RunResult:
         """Which lists it was trained and selected on, in words; "" without ``run.json``."""
         params = self.description.params
         return lists_of(params) if params else ""
+
+    @property
+    def machine(self) -> str:
+        """Graphics card of the process that began it, else its processor; "" where not recorded."""
+        return machine_name((self.provenance or [{}])[0])
 
     @property
     def provenance(self) -> list[dict[str, Any]]:

@@ -435,7 +435,9 @@ NODES: dict[str, Node[Any]] = {
 
 # Dotted keys in which two configurations of one run may differ.
 NOT_IN_KEY = (
-    *("name", "runs_dir", "out"),
+    "name",
+    "runs_dir",
+    "out",
     *(key for key, node in NODES.items() if not node.in_key),
     *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
 )
@@ -443,7 +445,9 @@ NOT_IN_KEY = (
 # Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
 # the scale. A duration is that of the scale unless it was typed.
 SHARED = (
-    *("seed", "runs_dir", "pretrained"),
+    "seed",
+    "runs_dir",
+    "pretrained",
     *(key for key, node in NODES.items() if node.shared is True),
     *(
         f"{key}.{each}"

@@ -54,8 +54,13 @@ GROUPS = ("dataset", "metric", "prediction", "consistency")
 # Settings of a finished run that may be changed: the source of the images and the counting, and
 # where code lies.
 CHANGEABLE = (
-    *(*GROUPS, "data", "transform.test_short_edge"),
-    *("trainer.accelerator", "trainer.threads", "trainer.precision", CHECKOUT),
+    *GROUPS,
+    "data",
+    "transform.test_short_edge",
+    "trainer.accelerator",
+    "trainer.threads",
+    "trainer.precision",
+    CHECKOUT,
 )
 
 

@@ -133,9 +133,12 @@ MFNET_LAYOUT = Layout(_mfnet_named, _mfnet_images, _mfnet_lists)
 _FRAMES_PER_VIDEO = 40
 # (split, night) -> recordings that the CRM release gives to it.
 _SETS = {
-    **{("train", False): (0, 1, 2), ("train", True): (3, 4, 5)},
-    **{("val", False): (6,), ("val", True): (10,)},
-    **{("test", False): (7, 8), ("test", True): (9, 11)},
+    ("train", False): (0, 1, 2),
+    ("train", True): (3, 4, 5),
+    ("val", False): (6,),
+    ("val", True): (10,),
+    ("test", False): (7, 8),
+    ("test", True): (9, 11),
 }
 
 # Id of pixels without a class, after the last class; training and scores ignore it.
@@ -221,8 +224,10 @@ _BAGS = {"train": range(1, VAL_BAG), "val": (VAL_BAG,), "test": (21, 22, 23, 24,
 _FRAME_STEP = 10
 # Which object of a street stands for which of the four; others are background.
 _STANDS_FOR = {
-    **{COLOR_CONE: "fire_extinguisher", CAR_STOP: "backpack"},
-    **{BUMP: "hand_drill", PERSON: "survivor"},
+    COLOR_CONE: "fire_extinguisher",
+    CAR_STOP: "backpack",
+    BUMP: "hand_drill",
+    PERSON: "survivor",
 }
 
 PST900_IDS = np.array(

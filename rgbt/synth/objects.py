@@ -236,8 +236,11 @@ def _cones(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
 
 # Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left).
 _GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[Placed]]], ...] = (
-    *((6.5, 26, _cars), (4.5, 18, _persons), (3.8, 13, _bikes)),
-    *((3.6, 11, _stops), (3.6, 12, _cones)),
+    (6.5, 26, _cars),
+    (4.5, 18, _persons),
+    (3.8, 13, _bikes),
+    (3.6, 11, _stops),
+    (3.6, 12, _cones),
 )
 
 

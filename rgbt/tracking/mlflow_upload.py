@@ -43,8 +43,15 @@ NAME_LENGTH, PARAM_LENGTH, TAG_LENGTH = 250, 500, 5000
 BATCH_METRICS, BATCH_PARAMS = 800, 100
 
 FILES = (
-    *("config.yaml", "provenance.json", "result.json", "*.patch", "counts_*.npz", "figures/*.png"),
-    *("evaluations/*.npz", "evaluations/robustness/*/*.npz", "evaluations/robustness/*/*.json"),
+    "config.yaml",
+    "provenance.json",
+    "result.json",
+    "*.patch",
+    "counts_*.npz",
+    "figures/*.png",
+    "evaluations/*.npz",
+    "evaluations/robustness/*/*.npz",
+    "evaluations/robustness/*/*.json",
 )
 # Files whose content is sent in another form.
 READ = ("run.json", "metrics.jsonl", "tables.json")

@@ -26,26 +26,29 @@ NOTES = (
 IMAGES = "images alone"
 
 ALWAYS = (
-    *("table", "paper", "claim", "source", "says", "remarks", "verdict", "contrast"),
-    *("printed", "as_printed", "margin", "missing", "reason", "how"),
+    "table",
+    "paper",
+    "claim",
+    "source",
+    "says",
+    "remarks",
+    "verdict",
+    "contrast",
+    "printed",
+    "as_printed",
+    "margin",
+    "missing",
+    "reason",
+    "how",
 )
 NUMBERS = ("estimate", "low", "high", "smallest", "seeds_needed")
 # Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
 
 # Of a claim without a verdict.
-WITHOUT: dict[str, Any] = {
-    **dict.fromkeys(NUMBERS, math.nan),
-    **{
-        "seeds": 0,
-        "starts": 0,
-        "covers": "",
-        "warning": "",
-        "images": "",
-        "scale": "",
-        "start": "",
-    },
-}
+WITHOUT: dict[str, Any] = dict.fromkeys(NUMBERS, math.nan)
+WITHOUT |= {"seeds": 0, "starts": 0}
+WITHOUT |= dict.fromkeys(("covers", "warning", "images", "scale", "start"), "")
 
 
 def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
@@ -54,8 +57,9 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
     Returns:
         the columns `ALWAYS` and those of `WITHOUT`. as_printed is True, False or None (not
         printed), margin that of "does as well as" (NaN of others), start and starts say from how
-        many initial weights the seeds began, and covers, smallest, seeds_needed and warning are
-        those of `analysis.uncertainty.verdicts.Verdict`.
+        many initial weights the seeds began, warning also says whether lists or machines of the
+        rows differ, and covers, smallest and seeds_needed are those of
+        `analysis.uncertainty.verdicts.Verdict`.
     """
     import pandas as pd
 
@@ -64,13 +68,20 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
         claim, found, basis = each.claim, each.verdict, each.basis
         is_similar = claim.expected == "similar" and claim.at_most is not None
         row: dict[str, Any] = {
-            **{"table": each.table, "paper": each.table.rpartition("/")[0] or "studies"},
-            **{"claim": claim.name, "source": claim.source, "says": claim.says},
-            **{"remarks": claim.remarks, "verdict": each.word, "contrast": each.contrast},
+            "table": each.table,
+            "paper": each.table.rpartition("/")[0] or "studies",
+            "claim": claim.name,
+            "source": claim.source,
+            "says": claim.says,
+            "remarks": claim.remarks,
+            "verdict": each.word,
+            "contrast": each.contrast,
             "printed": math.nan if each.printed is None else each.printed,
             "as_printed": each.as_printed,
             "margin": claim.at_most if is_similar else math.nan,
-            **{"missing": " | ".join(each.missing), "reason": each.reason, "how": how},
+            "missing": " | ".join(each.missing),
+            "reason": each.reason,
+            "how": how,
             **WITHOUT,
         }
         if found is not None:
@@ -81,6 +92,7 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
             one_start = basis.starts == 1 and found.seeds > 1
             row |= {"images": basis.images, "scale": basis.scale}
             row["start"] = "one start for all seeds" if one_start else "a start for each seed"
+            row["warning"] = " ".join(filter(None, (row["warning"], *basis.warnings)))
         row["starts"] = 0 if basis is None else min(row["seeds"], basis.starts)
         rows.append(row)
     return pd.DataFrame(rows, columns=[*ALWAYS, *WITHOUT]).astype({"as_printed": object})

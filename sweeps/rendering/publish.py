@@ -128,7 +128,8 @@ def print_preview(plan: TablePlan, outcomes: Sequence[Outcome], workers: int) ->
     if outcomes:
         cells = tuple(
             (
-                *(outcome.point.label, outcome.state),
+                outcome.point.label,
+                outcome.state,
                 ABSENT if outcome.seconds is None else f"{outcome.seconds:.0f}",
                 " ".join(outcome.keys) or ABSENT,
                 outcome.reason or (TRAINED if outcome.is_trained else ""),

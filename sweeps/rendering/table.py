@@ -37,7 +37,16 @@ FORMS: dict[Form, str] = {
 }
 COUNTED = f"Parameters are those of the networks at scale={SCALE}, without discriminators."
 CSV_HEADER = (
-    *("table", "row", "column", "mean", "sd", "n", "published", "difference", "reason", "runs"),
+    "table",
+    "row",
+    "column",
+    "mean",
+    "sd",
+    "n",
+    "published",
+    "difference",
+    "reason",
+    "runs",
 )
 
 

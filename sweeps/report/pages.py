@@ -105,7 +105,7 @@ class PaperView:
         is_run = frame["verdict"] != "not run"
         self.counted = counted(frame)
         self.judged = list(map(markdown, claim_grids(frame[is_run])))
-        tables = frame["table"].str.rpartition("/")[2]
+        tables = frame["table"].str.split("/").str[-1]
         lines = "- " + tables + ", `" + frame["claim"] + "`: " + frame["says"]
         self.not_run = "\n".join(lines[~is_run])
 
@@ -199,10 +199,13 @@ class Report:
     def _scores(self, run: RunResult) -> dict[str, Any]:
         """One line for each group of runs: its seeds, scores, time and tables."""
         tags, stored = run.tags, self.source.stored
-        counts, basis = stored.counts(run, OWN_COUNTS), stored.basis([run])
+        counts, basis = stored.counts(run, OWN_COUNTS), stored.basis({"": {0: run}})
         return {
-            **{"method": tags.get(GROUP, run.key), "dataset": counts.dataset},
-            **{"images": basis.images, "scale": basis.scale, "seed": int(tags["rgbt.seed"])},
+            "method": tags.get(GROUP, run.key),
+            "dataset": counts.dataset,
+            "images": basis.images,
+            "scale": basis.scale,
+            "seed": int(tags["rgbt.seed"]),
             **{name: value(name, counts, counts.absent) for name in (names.MIOU, names.VAR)},
             "time": float(run.result["seconds_of_last_process"]),
             "tables": "; ".join(sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG))),

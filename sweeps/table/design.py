@@ -157,8 +157,10 @@ class Design(Strict):
             own = worlds if name == TRAINED else {"natural": ()}
             for cell, words in own.items():
                 yield {
-                    **{"label": f"{method.name} {cell}", "group": name},
-                    **{"experiment": method.experiment, "settings": {"method": method.name}},
+                    "label": f"{method.name} {cell}",
+                    "group": name,
+                    "experiment": method.experiment,
+                    "settings": {"method": method.name},
                     "overrides": (*self.overrides, *words, *method.overrides),
                     "tested_in": worlds if name == TESTED else {},
                 }

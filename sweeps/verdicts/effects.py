@@ -28,8 +28,17 @@ MEAN = "mean of all cells"
 
 NUMBERS = ("value", "low", "high", "p", "p_holm")
 COLUMNS = (
-    *("part", "outcome", "method", "against", "effect", *NUMBERS, "shown"),
-    *("error_seeds", "error_images", "seeds", "cells"),
+    "part",
+    "outcome",
+    "method",
+    "against",
+    "effect",
+    *NUMBERS,
+    "shown",
+    "error_seeds",
+    "error_images",
+    "seeds",
+    "cells",
 )
 
 

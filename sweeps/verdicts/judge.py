@@ -54,11 +54,13 @@ class Basis:
         images: "synthetic", "real" or "unknown".
         scale: of the runs.
         starts: number of different initial weights of the runs.
+        warnings: rows of different lists; rows of one seed that were trained on different machines.
     """
 
     images: str
     scale: str
     starts: int
+    warnings: tuple[str, ...] = ()
 
 
 class StoredRuns:
@@ -66,7 +68,7 @@ class StoredRuns:
 
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str], Counts] = {}
-        self._settings: dict[str, tuple[str, str, str]] = {}
+        self._settings: dict[str, tuple[str, str, str, str, str]] = {}
 
     def counts(self, run: RunResult, path: str) -> Counts:
         """Counts of a run; InputError where they are missing, damaged or cannot be read."""
@@ -77,29 +79,42 @@ class StoredRuns:
                 raise InputError(f"run {run.key}: {error}") from error
         return self._counts[run.key, path]
 
-    def basis(self, runs: Iterable[RunResult]) -> Basis:
-        """What runs are about, by their stored settings; of several kinds of runs, all kinds."""
+    def basis(self, rows: Mapping[str, Mapping[int, RunResult]]) -> Basis:
+        """What the runs of rows, by seed, are about; of several kinds of runs, all kinds."""
         each = []
-        for run in runs:
-            if run.key not in self._settings:
-                self._settings[run.key] = _settings_of(run)
-            each.append(self._settings[run.key])
+        lists: dict[str, dict[str, None]] = {}
+        machines: dict[int, set[str]] = {}
+        for label, runs in rows.items():
+            for seed, run in runs.items():
+                if run.key not in self._settings:
+                    self._settings[run.key] = _settings_of(run)
+                *settings, run_lists, machine = self._settings[run.key]
+                each.append(settings)
+                lists.setdefault(run_lists, {})[label] = None
+                machines.setdefault(seed, set()).add(machine)
         images, scales, starts = (set(values) for values in zip(*each, strict=True))
-        return Basis(" and ".join(sorted(images)), " and ".join(sorted(scales)), len(starts))
+        mixed = [str(seed) for seed, found in machines.items() if len(found - {""}) > 1]
+        shown = "; ".join(f"{', '.join(labels)} {name}" for name, labels in lists.items() if name)
+        warnings = (
+            f"Different lists: {shown}." * (len(lists.keys() - {""}) > 1),
+            f"Seeds {', '.join(mixed)} mix machines, which train differently." * bool(mixed),
+        )
+        kinds = (" and ".join(sorted(values)) for values in (images, scales))
+        return Basis(*kinds, len(starts), tuple(filter(None, warnings)))
 
 
-def _settings_of(run: RunResult) -> tuple[str, str, str]:
-    """Kind of images, scale and initial weights of a run."""
+def _settings_of(run: RunResult) -> tuple[str, str, str, str, str]:
+    """Kind of images, scale, initial weights, lists and machine of a run."""
     config = run.folder / "config.yaml"
     if not config.is_file():
-        return "unknown", "unknown", run.key
+        return "unknown", "unknown", run.key, run.lists, run.machine
     settings = read_settings(config)
     seed, scale = str(settings["seed"]), str(settings["scale"]["name"])
     images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
     start = str(settings.get("pretrained") or settings["model"].get("weights") or "")
     is_common = start.startswith("common:") and settings["seeds"]["start"] == "common"
     is_file = bool(start) and not start.startswith(("common:", "experiment:"))
-    return images, scale, "0" if is_common or is_file else seed
+    return images, scale, "0" if is_common or is_file else seed, run.lists, run.machine
 
 
 class SameRunsError(InputError):
@@ -286,7 +301,7 @@ class TableJudge:
         if not evidences:
             shown = _mean(printed) if mean else printed[0]
             return judged(contrast=contrasts[0].label, printed=shown, reason=reasons[0])
-        basis = self.stored.basis(run for each in finished.values() for run in each.values())
+        basis = self.stored.basis(finished)
         verdict = decide(
             list(evidences.values()),
             claim.range,

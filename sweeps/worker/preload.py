@@ -16,8 +16,12 @@ from rgbt.runs.source_code import loaded_modules, user_code
 PROGRAMS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency", "rgbt.api")
 
 LIBRARIES = (
-    *("torch", "hydra", "scipy.optimize", "sweeps.worker.processes"),
-    *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
+    "torch",
+    "hydra",
+    "scipy.optimize",
+    "sweeps.worker.processes",
+    "mlflow",
+    "mlflow.store.tracking.sqlalchemy_store",
 )
 
 gc.disable()  # nothing that is imported here is garbage

@@ -28,7 +28,9 @@ CONSOLE = Console(stderr=True)
 def bars() -> Progress:
     """Bars of rich, shown in a terminal only."""
     return Progress(
-        *(TextColumn("{task.description}", markup=False), BarColumn(24), MofNCompleteColumn()),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(24),
+        MofNCompleteColumn(),
         TimeRemainingColumn(),
         console=CONSOLE,
         transient=True,

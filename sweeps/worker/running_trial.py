@@ -175,7 +175,9 @@ class RunningTrial:
         # Each protocol of consistency has a fixed file inside the run folder.
         out = f"out={result.folder / evaluation.out}"
         command = (
-            *(module, f"run={result.folder}", *arguments),
+            module,
+            f"run={result.folder}",
+            *arguments,
             out if evaluation.frames is None else f"runs_dir={result.folder.parent}",
             *([f"trust={self.trust}"] if self.trust else []),
             # The run may come from a machine with another data folder.

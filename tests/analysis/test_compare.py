@@ -16,6 +16,7 @@ from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import PROTOCOLS, file_name
+from rgbt.runs.folder import Description, RunFolder
 from tests.analysis.robust_runs import SCORES, less, write_run
 from tests.analysis.test_results import COMMAS, make_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
@@ -63,9 +64,15 @@ def test_table_sentence_and_files_hold_the_compared_numbers(
     assert [row["metric"] for row in rows] == [each.metric for each in found.differences]
     for row, each in zip(rows, found.differences, strict=True):
         numbers = {
-            **{"a": each.a.value, "b": each.b.value, "difference": each.value},
-            **{"images_low": each.interval.low, "images_high": each.interval.high},
-            **{"p": each.difference.p, "p_holm": each.p_corrected, "seeds_a": 1, "seeds_b": 1},
+            "a": each.a.value,
+            "b": each.b.value,
+            "difference": each.value,
+            "images_low": each.interval.low,
+            "images_high": each.interval.high,
+            "p": each.difference.p,
+            "p_holm": each.p_corrected,
+            "seeds_a": 1,
+            "seeds_b": 1,
         }
         assert {key: float(row[key]) for key in numbers} == pytest.approx(numbers, rel=1e-6)
         assert row["both_low"] == row["both_high"] == ""
@@ -214,3 +221,16 @@ def test_arguments_that_make_no_sense_are_refused(
     code, out, err = call(entry, *(f"{key}={text}" for key, text in given.items()))
     assert (code, out) == (2, "")
     assert_one_sentence(err, word.format(tmp_path))
+
+
+def test_different_lists_are_said(call: Call, tmp_path: Path) -> None:
+    for (key, split), counts in zip((("aaa0", "train"), ("bbb0", "all")), pair(), strict=True):
+        folder = make_run(tmp_path / "runs", key, key, 0)
+        params = {"domains.source.split": split}
+        RunFolder(folder).describe(Description(key, {"rgbt.group": key, "rgbt.seed": "0"}, params))
+        counts.save(folder / "counts_test.npz")
+    words = ("a=aaa0", "b=bbb0", f"runs_dir={tmp_path / 'runs'}", *FAST)
+    code, out, err = call(entry, *words)
+    assert (code, err) == (0, "")
+    said = "aaa0 trained on train, selected on val; bbb0 trained on all, selected on val."
+    assert said in " ".join(out.split())

@@ -55,8 +55,13 @@ def test_data_set_without_background_has_no_occupancy(call: Call, tmp_path: Path
     out = tmp_path / "statistics"
     root = write_kp(tmp_path / "data")
     code, printed, said = call(
-        *(entry, "dataset=kp", f"dataset.root={root}", "split=test", "regions=2"),
-        *("resamples=100", f"out={out}"),
+        entry,
+        "dataset=kp",
+        f"dataset.root={root}",
+        "split=test",
+        "regions=2",
+        "resamples=100",
+        f"out={out}",
     )
     assert code == 0, said
     assert printed.count("Sample occupancy is not available: no class of kp is stated") == 1

@@ -99,8 +99,13 @@ def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Pat
         (folder / "labels").mkdir(parents=True, exist_ok=True)
         (folder / "labels" / f"{name}.png").touch()
     said = {
-        **{"format": FORMAT, "digest": "abc", "classes": list(dataset.classes)},
-        **{"kept": 0.5, "threshold": 0.9, "fingerprint": dataset.fingerprint(), **changes},
+        "format": FORMAT,
+        "digest": "abc",
+        "classes": list(dataset.classes),
+        "kept": 0.5,
+        "threshold": 0.9,
+        "fingerprint": dataset.fingerprint(),
+        **changes,
     }
     (folder / "pseudo_labels.json").write_text(json.dumps(said))
     return folder

@@ -144,8 +144,12 @@ class Case:
             loss = build(self.config.loss)
             forward.record = network.record  # type: ignore[attr-defined]
             scheme = CRM(
-                **{"model": forward, "loss": loss, "masker": hide},
-                **{"modality_weight": 1.0, "complementary_weight": 1.0, "nonlocal_weight": 1.0},
+                model=forward,
+                loss=loss,
+                masker=hide,
+                modality_weight=1.0,
+                complementary_weight=1.0,
+                nonlocal_weight=1.0,
             )
             (phase,) = scheme.phases(batch, generator_of)
             parts = phase.parts

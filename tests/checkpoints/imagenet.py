@@ -14,8 +14,11 @@ from tests.checkpoints.files import named, tensor
 ENDS = ("weight", "bias")
 STATISTICS = (*ENDS, "running_mean", "running_var")
 BLOCKS = {
-    **{18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3)},
-    **{152: (3, 8, 36, 3)},
+    18: (2, 2, 2, 2),
+    34: (3, 4, 6, 3),
+    50: (3, 4, 6, 3),
+    101: (3, 4, 23, 3),
+    152: (3, 8, 36, 3),
 }
 
 

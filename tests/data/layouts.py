@@ -236,8 +236,11 @@ def write_videos(root: Path) -> Path:
 def video(root: Path, **keys: Any) -> Video:
     """The reader of what `write_videos` writes."""
     settings: dict[str, Any] = {
-        **{"num_classes": 3, "classes": CLASSES, "rgb": "{video}/rgb/{name}.png"},
-        **{"thermal": "{video}/ir/{name}.png", "label": "{video}/label/{name}.png"},
+        "num_classes": 3,
+        "classes": CLASSES,
+        "rgb": "{video}/rgb/{name}.png",
+        "thermal": "{video}/ir/{name}.png",
+        "label": "{video}/label/{name}.png",
         "lists": {split: f"{split}.txt" for split in ("train", "val", "test")},
     }
     return Video(str(root), **(settings | keys))

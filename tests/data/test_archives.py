@@ -197,9 +197,15 @@ def test_reads_the_layout_of_the_release(kp_root: Path) -> None:
 def test_splits_by_set_number(kp_root: Path) -> None:
     dataset = KP(str(kp_root), lists="sets")
     assert {split: dataset.names(split) for split in dataset.splits} == {
-        **{"train": TRAIN, "train_day": TRAIN[:2], "train_night": TRAIN[2:]},
-        **{"val": VAL, "val_day": VAL[:1], "val_night": VAL[1:]},
-        **{"test": TEST, "test_day": TEST[:2], "test_night": TEST[2:]},
+        "train": TRAIN,
+        "train_day": TRAIN[:2],
+        "train_night": TRAIN[2:],
+        "val": VAL,
+        "val_day": VAL[:1],
+        "val_night": VAL[1:],
+        "test": TEST,
+        "test_day": TEST[:2],
+        "test_night": TEST[2:],
     }
     assert dataset.splits["train_day"] == "labels of the sets [0, 1, 2]"
     nights = dataset.nights(tuple(f"set{number:02d}_V000_I00000" for number in range(12)))

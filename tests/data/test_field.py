@@ -141,12 +141,11 @@ def test_a_split_of_several_lists(tmp_path: Path) -> None:
 
 def test_lists_of_a_run_in_words() -> None:
     params = {
-        **{"dataset.splits.train": "['train.txt', 'val.txt']", "dataset.splits.val": "val.txt"},
-        **{
-            "trainer.selection_split": "val",
-            "trainer.tested": "best",
-            "domains.source.split": "train",
-        },
+        "dataset.splits.train": "['train.txt', 'val.txt']",
+        "dataset.splits.val": "val.txt",
+        "trainer.selection_split": "val",
+        "trainer.tested": "best",
+        "domains.source.split": "train",
     }
     assert lists_of(params) == "trained on train.txt + val.txt, selected on val.txt"
     assert lists_of({**params, "trainer.tested": "last"}).endswith("val.txt, last checkpoint")

@@ -104,8 +104,10 @@ def test_packed_files(tmp_path: Path) -> None:
         write_png(tmp_path / split / "7.png", image)
         write_png(tmp_path / split / "7_mask.png", np.ones(HW, np.uint8))
     keys: dict[str, Any] = {
-        **{"rgb": "{split}/{name}.png", "thermal": "{split}/{name}.png"},
-        **{"label": "{split}/{name}_mask.png", "thermal_range": None},
+        "rgb": "{split}/{name}.png",
+        "thermal": "{split}/{name}.png",
+        "label": "{split}/{name}_mask.png",
+        "thermal_range": None,
     }
     sample = folder(tmp_path, **keys).read("train_7")
     np.testing.assert_array_equal(sample.rgb, image[..., :3])
@@ -204,8 +206,10 @@ def test_all_in_one_folder(tmp_path: Path) -> None:
             write_png(tmp_path / f"{name}_{kind}.png", np.zeros(HW, np.uint8))
     dataset = folder(
         tmp_path,
-        **{"rgb": "{split}_{name}.png", "thermal": "{split}_{name}_ir.png"},
-        **{"label": "{split}_{name}_mask.png", "thermal_range": None},
+        rgb="{split}_{name}.png",
+        thermal="{split}_{name}_ir.png",
+        label="{split}_{name}_mask.png",
+        thermal_range=None,
     )
     assert list(dataset.frames) == ["test_1", "train_9", "train_10", "val_1"]
     assert check_dataset(dataset).problems == ()

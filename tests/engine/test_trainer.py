@@ -25,13 +25,24 @@ from rgbt.types import Batch, GeneratorOf, Phase
 from tests.checkpoints.test_torch_files import same
 
 SETTINGS = {
-    **{"max_steps": 6, "eval_every": 3, "checkpoint_every": 2, "log_every": 1, "accumulate": 1},
-    **{"clip_norm": 1.0, "precision": "32-true", "accelerator": "cpu", "threads": 1},
+    "max_steps": 6,
+    "eval_every": 3,
+    "checkpoint_every": 2,
+    "log_every": 1,
+    "accumulate": 1,
+    "clip_norm": 1.0,
+    "precision": "32-true",
+    "accelerator": "cpu",
+    "threads": 1,
     "selection_split": "val",
 }
 ADAMW: dict[str, Any] = {
-    **{"lr": 0.1, "backbone_multiplier": 1.0, "weight_decay": 0.05, "decay_biases": True},
-    **{"betas": (0.9, 0.999), "eps": 1e-8},
+    "lr": 0.1,
+    "backbone_multiplier": 1.0,
+    "weight_decay": 0.05,
+    "decay_biases": True,
+    "betas": (0.9, 0.999),
+    "eps": 1e-8,
 }
 
 

@@ -50,8 +50,12 @@ def test_late_thermal_is_that_of_a_previous_frame(
 
 def test_frames_of_day_and_night_are_separate() -> None:
     assert dict(zip(NAMES, shown(corrupted(Recorded(), "delayed", 1), NAMES), strict=True)) == {
-        **{"00001D": "00001D", "00003D": "00001D", "00004D": "00003D", "00006D": "00004D"},
-        **{"00002N": "00002N", "00005N": "00002N"},
+        "00001D": "00001D",
+        "00003D": "00001D",
+        "00004D": "00003D",
+        "00006D": "00004D",
+        "00002N": "00002N",
+        "00005N": "00002N",
     }
 
 

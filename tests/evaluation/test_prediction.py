@@ -28,7 +28,10 @@ def session_of(source: dict[str, object], **changes: object) -> SimpleNamespace:
     target = {"split": "x", "view": "rgb", "head": "dark", "labels": "none"}
     given = {
         "source": Domain(**{"split": "x", "view": None, "head": None, "labels": "given", **source}),
-        **{"target": None, "target_is": None, "tested_head": "own", **changes},
+        "target": None,
+        "target_is": None,
+        "tested_head": "own",
+        **changes,
     }
     if given["target_is"] is not None:
         given["target"] = Domain(**target)
@@ -75,7 +78,9 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
     session.prediction = Prediction()
     predictor = Predictor(session, session.model, EvaluationRequest(split="test"))
     batch = Batch(
-        **{"rgb": torch.zeros(3, 3, 2, 2), "thermal": torch.zeros(3, 1, 2, 2), "position": None},
+        rgb=torch.zeros(3, 3, 2, 2),
+        thermal=torch.zeros(3, 1, 2, 2),
+        position=None,
         label=torch.zeros(3, 2, 2, dtype=torch.int64),
         name=("day", "night", "day"),
         centre_yx=torch.zeros(3, 2, dtype=torch.int64),

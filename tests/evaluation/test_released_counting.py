@@ -52,7 +52,11 @@ def batch(label: Any, dtype: torch.dtype = torch.uint8) -> Batch:
     label = torch.tensor(np.asarray(label), dtype=dtype)[None]
     ramp = torch.linspace(0, 1, 4).expand(1, 3, 2, 4)
     return Batch(
-        **{"rgb": ramp, "thermal": ramp[:, :1], "label": label, "name": ("a",), "position": None},
+        rgb=ramp,
+        thermal=ramp[:, :1],
+        label=label,
+        name=("a",),
+        position=None,
         centre_yx=torch.zeros(1, 2, dtype=torch.int64),
         original_hw=torch.tensor([label.shape[-2:]]),
     )

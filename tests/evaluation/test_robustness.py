@@ -64,8 +64,11 @@ class Evaluator:
         counts = Counts(
             counts=np.array([[[[right, 100 - right], [0, 100]]]] * 2),
             names=("1D", "2N"),
-            **{"night": (False, True), "classes": ("road", "car"), "partition": "ring1"},
-            **{"dataset": "fingerprint", "split": request.split},
+            night=(False, True),
+            classes=("road", "car"),
+            partition="ring1",
+            dataset="fingerprint",
+            split=request.split,
         )
         return SimpleNamespace(counts=counts)
 

@@ -227,5 +227,7 @@ def test_fractions_are_shown_in_percent() -> None:
     for name in ("ECE", "day/boundary_mIoU", "region/1/ECE", "distance/0-10", "size/0-64"):
         assert in_percent(name, 0.5) == 50.0
     assert shown({"mIoU": 0.12346, "Var": 0.127, "loss": 0.127}) == {
-        **{"mIoU": 12.35, "Var": 0.13, "loss": 0.127}
+        "mIoU": 12.35,
+        "Var": 0.13,
+        "loss": 0.127,
     }

@@ -115,9 +115,14 @@ BY_HAND = {
 
 def counts_of(*regions: object) -> Counts:
     return Counts(
-        **{"counts": np.array([regions], np.int32), "names": ("0",), "night": None},
-        **{"classes": CLASSES, "partition": f"ring{len(regions)}", "dataset": "f"},
-        **{"split": "test", "unscored": ("void",)},
+        counts=np.array([regions], np.int32),
+        names=("0",),
+        night=None,
+        classes=CLASSES,
+        partition=f"ring{len(regions)}",
+        dataset="f",
+        split="test",
+        unscored=("void",),
     )
 
 

@@ -63,7 +63,7 @@ def recorded(pattern: str, *, fast: Collection[str], folder: str = "") -> list[A
     found = [(path.stem, re.fullmatch(pattern, path.stem)) for path in paths]
     return [
         pytest.param(
-            *(folder + name, match[1]), id=name, marks=() if name in fast else pytest.mark.slow
+            folder + name, match[1], id=name, marks=() if name in fast else pytest.mark.slow
         )
         for name, match in sorted(found)
         if match

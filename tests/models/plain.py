@@ -82,7 +82,10 @@ def half(thermal_channels: int) -> Inputs:
     """0..1 to -1..1."""
     values = (127.5, 127.5, 127.5)
     return Inputs(
-        **{"rgb_order": "rgb", "rgb_mean": values, "rgb_std": values, "thermal_scale": "fixed"},
+        rgb_order="rgb",
+        rgb_mean=values,
+        rgb_std=values,
+        thermal_scale="fixed",
         thermal_mean=values[:thermal_channels],
         thermal_std=values[:thermal_channels],
     )

@@ -14,8 +14,10 @@ from tests.models.golden import network
 from tests.models.plain import NANO, cells, count, generator, images, nano, normal, randomise
 
 MODIFIED = {
-    **{"ceil_mode": False, "decoder": "modified_heatnet"},
-    **{"dropout": (0.3, 0.15), "align_corners": False},
+    "ceil_mode": False,
+    "decoder": "modified_heatnet",
+    "dropout": (0.3, 0.15),
+    "align_corners": False,
 }
 LITERAL = {"ceil_mode": False, "decoder": "modified_thesis", "align_corners": False}
 CASES: list[tuple[str, dict[str, Any]]] = [

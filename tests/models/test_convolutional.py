@@ -29,8 +29,12 @@ from tests.models.test_contract import CASES, LITERAL, MODIFIED
 
 def inputs(**changes: Any) -> Inputs:
     values: dict[str, Any] = {
-        **{"rgb_order": "rgb", "rgb_mean": (0.0, 51.0, 102.0), "rgb_std": (255.0, 51.0, 25.5)},
-        **{"thermal_mean": (0.0,), "thermal_std": (255.0,), "thermal_scale": "fixed"},
+        "rgb_order": "rgb",
+        "rgb_mean": (0.0, 51.0, 102.0),
+        "rgb_std": (255.0, 51.0, 25.5),
+        "thermal_mean": (0.0,),
+        "thermal_std": (255.0,),
+        "thermal_scale": "fixed",
     }
     return Inputs(**{**values, **changes})
 

@@ -24,8 +24,11 @@ from tests.models.golden import network
 from tests.models.plain import cells, count, images, normal, randomise
 
 ROTARY: dict[str, Any] = {
-    **{"position_grid": None, "position_resize": None, "rope_base": 100.0},
-    **{"key_bias": False, "embed_dim": 24},
+    "position_grid": None,
+    "position_resize": None,
+    "rope_base": 100.0,
+    "key_bias": False,
+    "embed_dim": 24,
 }
 
 
@@ -43,10 +46,14 @@ def published_shapes(width: int, registers: int) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a published file of S or B."""
     d = width
     shapes: dict[str, tuple[int, ...]] = {
-        **{"cls_token": (1, 1, d), "pos_embed": (1, 1 + 37 * 37, d), "mask_token": (1, d)},
+        "cls_token": (1, 1, d),
+        "pos_embed": (1, 1 + 37 * 37, d),
+        "mask_token": (1, d),
         **({"register_tokens": (1, registers, d)} if registers else {}),
-        **{"patch_embed.proj.weight": (d, 3, 14, 14), "patch_embed.proj.bias": (d,)},
-        **{"norm.weight": (d,), "norm.bias": (d,)},
+        "patch_embed.proj.weight": (d, 3, 14, 14),
+        "patch_embed.proj.bias": (d,),
+        "norm.weight": (d,),
+        "norm.bias": (d,),
     }
     for block in range(12):
         linear = {"attn.qkv": (3 * d, d), "attn.proj": (d, d), "mlp.fc1": (4 * d, d)}
@@ -288,7 +295,10 @@ def test_the_bias_of_the_keys_does_not_count() -> None:
 # ---- the network ----
 nano = partial(plain.nano, "dinov2")
 ADAMW = AdamW(
-    **{"lr": 1.0, "backbone_multiplier": 0.1, "weight_decay": 0.05, "decay_biases": True},
+    lr=1.0,
+    backbone_multiplier=0.1,
+    weight_decay=0.05,
+    decay_biases=True,
     betas=(0.9, 0.999),
     eps=1e-8,
 )

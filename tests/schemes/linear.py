@@ -119,9 +119,17 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     builders = record_of(scheme).builders
     built |= {name: build(others[name]) for name, build in builders.items()}
     settings: dict[str, Any] = {
-        **{"max_steps": steps, "eval_every": 1000, "checkpoint_every": 1000, "log_every": 1},
-        **{"accumulate": 1, "clip_norm": None, "precision": "32-true", "accelerator": "cpu"},
-        **{"threads": 1, "selection_split": "val", **changes},
+        "max_steps": steps,
+        "eval_every": 1000,
+        "checkpoint_every": 1000,
+        "log_every": 1,
+        "accumulate": 1,
+        "clip_norm": None,
+        "precision": "32-true",
+        "accelerator": "cpu",
+        "threads": 1,
+        "selection_split": "val",
+        **changes,
     }
     log: list[dict[str, float]] = []
     made = Trainer(

@@ -85,9 +85,15 @@ def in_float64(name: str, **changes: Any) -> Any:
 # ---- cases ----------------------------------------------------------------------------------
 
 GAUSSIAN = Masker(
-    **{"sampler": "gaussian_count", "patch_size": 16, "ratio": 0.5, "sigma_div": 2.0},
-    **{"sigma_height": None, "anchor": "tracked", "cell_position": "index"},
-    **{"pairing": "rand_comp", "pattern_probabilities": None},
+    sampler="gaussian_count",
+    patch_size=16,
+    ratio=0.5,
+    sigma_div=2.0,
+    sigma_height=None,
+    anchor="tracked",
+    cell_position="index",
+    pairing="rand_comp",
+    pattern_probabilities=None,
 )
 NOT_USED = dict.fromkeys(("sigma_div", "anchor", "cell_position"))
 INDEPENDENT = replace(GAUSSIAN, sampler="uniform", pairing="indiv", **NOT_USED)
@@ -152,8 +158,12 @@ def unlabelled(loss: Any, *, guidance: float = 0.0, heads: bool = False) -> Case
 
 def self_training(*, heads: bool = False, **changes: Any) -> Case:
     settings: dict[str, Any] = {
-        **{"threshold": 0.4, "ignored_top": 0.1, "ignored_bottom": 0.2, "jitter": 1.0},
-        **{"domains": test_domains.linear.domains(heads, labels="none"), "loss": THREE},
+        "threshold": 0.4,
+        "ignored_top": 0.1,
+        "ignored_bottom": 0.2,
+        "jitter": 1.0,
+        "domains": test_domains.linear.domains(heads, labels="none"),
+        "loss": THREE,
     }
 
     def make(net: Any, _: bool, **more: Any) -> Any:

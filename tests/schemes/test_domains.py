@@ -51,7 +51,8 @@ def unlabelled(model: Linear, heads: bool = False, **changes: Any) -> Unlabelled
         "loss": linear.cross_entropy,
         "domains": linear.domains(heads, labels="none"),
         "unlabelled": MaxSquares(weight=0.7, normalisation="entries", image_wise_ratio=None),
-        **{"guidance_weight": 0.0, "guidance_threshold": 0.5},
+        "guidance_weight": 0.0,
+        "guidance_threshold": 0.5,
     }
     return UnlabelledTarget(model=model, **{**given, **changes})
 
@@ -134,14 +135,27 @@ def test_supervised_shows_the_domain_to_its_head() -> None:
 # ---- adversarial: the same by matrices -----------------------------------------------------------
 
 PAPERS: dict[str, Any] = {
-    **{"judged": "probabilities", "verdict_loss": "least_squares", "source_value": 0.0},
-    **{"target_value": 1.0, "weight": 0.4, "both_ways": False, "weighed_by_confidence": False},
-    **{"halved": False, "supervise_target": False, "alternates": False, "gradients": "apart"},
+    "judged": "probabilities",
+    "verdict_loss": "least_squares",
+    "source_value": 0.0,
+    "target_value": 1.0,
+    "weight": 0.4,
+    "both_ways": False,
+    "weighed_by_confidence": False,
+    "halved": False,
+    "supervise_target": False,
+    "alternates": False,
+    "gradients": "apart",
 }
 HEATNET = {
     **PAPERS,
-    **{"judged": "logits", "source_value": 1.0, "target_value": 0.0, "both_ways": True},
-    **{"weighed_by_confidence": True, "supervise_target": True, "alternates": True},
+    "judged": "logits",
+    "source_value": 1.0,
+    "target_value": 0.0,
+    "both_ways": True,
+    "weighed_by_confidence": True,
+    "supervise_target": True,
+    "alternates": True,
 }
 
 
@@ -158,7 +172,8 @@ def scheme_of(model: nn.Module, heads: bool = False, **changes: Any) -> Adversar
     given: dict[str, Any] = {
         "loss": linear.cross_entropy,
         "domains": linear.domains(heads, labels=labels, confidence=confidence),
-        **{"critic": critic(), "critic_optimizer": sgd},
+        "critic": critic(),
+        "critic_optimizer": sgd,
     }
     return Adversarial(model=model, **{**given, **settings})
 

@@ -17,7 +17,9 @@ from tests.losses.problems import batch_of
 
 ONE = Domains(
     source=Domain(split="train", view=None, head=None, labels="given"),
-    **{"target": None, "target_is": None, "tested_head": "own"},
+    target=None,
+    target_is=None,
+    tested_head="own",
 )
 B, Q, K = 2, 3, 4
 

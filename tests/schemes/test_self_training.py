@@ -166,14 +166,24 @@ class Halves:
 
 def scheme_of(model: Linear, *, jitter: float = 0.0, **changes: Any) -> Any:
     settings: dict[str, Any] = {
-        **{"decay": 0.999, "teacher_norm": "batch", "threshold": THRESHOLD},
-        **{"weighted_by": "batch", "ignored_top": 0.0, "ignored_bottom": 0.0},
-        **{"mixing": "classes", "masked_weight": 0.5, "masked_images": "target"},
-        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves()},
-        **{"loss": CrossEntropy(class_weights=None), **changes},
+        "decay": 0.999,
+        "teacher_norm": "batch",
+        "threshold": THRESHOLD,
+        "weighted_by": "batch",
+        "ignored_top": 0.0,
+        "ignored_bottom": 0.0,
+        "mixing": "classes",
+        "masked_weight": 0.5,
+        "masked_images": "target",
+        "domains": domains(False, labels="none", view="rgb"),
+        "masker": Halves(),
+        "loss": CrossEntropy(class_weights=None),
+        **changes,
     }
     strong = StrongAugmentation(
-        **{"jitter_probability": jitter, "jitter_strength": 0.2, "blur_probability": jitter},
+        jitter_probability=jitter,
+        jitter_strength=0.2,
+        blur_probability=jitter,
         blur_sigma=(0.15, 1.15),
     )
     return SelfTraining(model=model, augmentation=strong, **settings)

@@ -73,9 +73,15 @@ class Recorded:
 def view(**changes: Any) -> VirtualView:
     settings: dict[str, Any] = {
         "camera": Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=48, width=64),
-        **{"order": "zyx", "yaw": (-10.0, 10.0), "pitch": (-10.0, 10.0), "roll": (-5.0, 5.0)},
-        **{"angles": "uniform", "mode": "both", "rectangle": "largest"},
-        **{"resampling": "once", "outside": "ignore"},
+        "order": "zyx",
+        "yaw": (-10.0, 10.0),
+        "pitch": (-10.0, 10.0),
+        "roll": (-5.0, 5.0),
+        "angles": "uniform",
+        "mode": "both",
+        "rectangle": "largest",
+        "resampling": "once",
+        "outside": "ignore",
     }
     return VirtualView(**{**settings, **changes})
 

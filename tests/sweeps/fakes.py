@@ -41,8 +41,13 @@ def settings(**changes: Any) -> SweepSettings:
     none = ("storage", "gpus", "timeout_minutes", "study", "pruner", "trials")
     plain: dict[str, Any] = {
         **dict.fromkeys((*none, "hours")),
-        **{"workers": 1, "retry": "none"},
-        **{"wait": False, "dry_run": False, "params": {}, "points": (), "space": {}},
+        "workers": 1,
+        "retry": "none",
+        "wait": False,
+        "dry_run": False,
+        "params": {},
+        "points": (),
+        "space": {},
         "objectives": (Objective("test/mIoU", "maximize"),),
         "sampler": {"_target_": "optuna.samplers.RandomSampler", "seed": 0},
         "replicates": 1,
@@ -116,8 +121,12 @@ def finish(
     counts(dataset=dataset).save(run.path / counts_name("test"))
     run.finish(
         {
-            **{"name": f"fake {folder.name}", "key": folder.name, "dataset": dataset},
-            **{"steps": 4, "best_step": 4, "seconds_of_last_process": 2.5},
+            "name": f"fake {folder.name}",
+            "key": folder.name,
+            "dataset": dataset,
+            "steps": 4,
+            "best_step": 4,
+            "seconds_of_last_process": 2.5,
             "val": {"mIoU": 0.5} if val is None else dict(val),
             "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
         }

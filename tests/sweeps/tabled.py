@@ -48,9 +48,9 @@ class FakeResult:
     commit: str | None = "aaaaaaaaaa"
     other_code: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
-    lists: str = ""
     folder: Path = Path("nowhere")
     lists: str = ""
+    machine: str = ""
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
         return self.by_path[path]

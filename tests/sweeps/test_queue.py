@@ -149,3 +149,16 @@ def test_dry_run_prints_the_order_with_minutes(
     assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
     assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
     assert not (place / "runs").exists()
+
+
+def test_a_table_with_runs_of_another_machine_waits(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(place, table="my/two")[0] == 0
+    for archive in sorted((place / "results").glob("*.zip"))[1:]:
+        archive.unlink()
+    there = place / "there"
+    there.mkdir()
+    monkeypatch.setattr("rgbt.runs.result.RunResult.machine", "another")
+    code, order = run(there, archive=place / "results")
+    assert (code, order[:2], len(order)) == (0, ["crm", "baseline"], 4)

@@ -66,11 +66,15 @@ class Embedded(NamedTuple):
 EMBEDDED = {
     "synth": Embedded(datasets.MFNET_LAYOUT, MFNet, ("unlabeled",), planned("synth")),
     "synth_kp": Embedded(
-        *(datasets.KP_LAYOUT, KP, ()),
+        datasets.KP_LAYOUT,
+        KP,
+        (),
         planned("synth_kp", NUMBERS, replace(SMALL, night_share=0.48)),
     ),
     "synth_pst900": Embedded(
-        *(datasets.PST900_LAYOUT, lambda root: PST900(root, val_bags=(20,)), ("background",)),
+        datasets.PST900_LAYOUT,
+        lambda root: PST900(root, val_bags=(20,)),
+        ("background",),
         planned("synth_pst900", NUMBERS, replace(SMALL, field_of_view_deg=80.0)),
     ),
     "synth_freiburg": Embedded(
@@ -363,20 +367,32 @@ def test_freiburg_counts_and_margins_by_hand() -> None:
 
 BY_HAND: dict[str, dict[str, list[tuple[int, str]]]] = {
     "kp": {
-        **{"sky": [(0, "sky")], "sidewalk": [(0, "paving"), (CURVE, "kerb_top")]},
-        **{"road": [(0, "asphalt"), (0, "manhole"), (BUMP, "yellow")]},
-        **{"vegetation": [(0, "leaf"), (0, "bark")], "terrain": [(0, "grass")]},
-        **{"wall": [(0, "wall")], "building": [(0, "far_wall")], "pole": [(0, "pole")]},
+        "sky": [(0, "sky")],
+        "sidewalk": [(0, "paving"), (CURVE, "kerb_top")],
+        "road": [(0, "asphalt"), (0, "manhole"), (BUMP, "yellow")],
+        "vegetation": [(0, "leaf"), (0, "bark")],
+        "terrain": [(0, "grass")],
+        "wall": [(0, "wall")],
+        "building": [(0, "far_wall")],
+        "pole": [(0, "pole")],
         # A tyre is of the car or of the bike that it belongs to, a shoe of the person.
-        **{"traffic_sign": [(0, "sign_red")], "car": [(CAR, "tyre")], "bicycle": [(BIKE, "tyre")]},
-        **{"person": [(PERSON, "shoe")], "fence": [(GUARDRAIL, "rail_dark")]},
+        "traffic_sign": [(0, "sign_red")],
+        "car": [(CAR, "tyre")],
+        "bicycle": [(BIKE, "tyre")],
+        "person": [(PERSON, "shoe")],
+        "fence": [(GUARDRAIL, "rail_dark")],
         VOID: [(0, "wire"), (CAR_STOP, "yellow")],
     },
     "freiburg": {
-        **{"sky": [(0, "sky")], "road": [(0, "asphalt"), (BUMP, "yellow")]},
-        **{"vegetation": [(0, "leaf"), (0, "bark")], "curb": [(CURVE, "kerb_top")]},
-        **{"car": [(CAR, "tyre")], "bicycle": [(BIKE, "tyre")], "person": [(PERSON, "shoe")]},
-        **{"building": [(0, "vent")], "pole": [(0, "transformer")]},
+        "sky": [(0, "sky")],
+        "road": [(0, "asphalt"), (BUMP, "yellow")],
+        "vegetation": [(0, "leaf"), (0, "bark")],
+        "curb": [(CURVE, "kerb_top")],
+        "car": [(CAR, "tyre")],
+        "bicycle": [(BIKE, "tyre")],
+        "person": [(PERSON, "shoe")],
+        "building": [(0, "vent")],
+        "pole": [(0, "transformer")],
     },
 }
 

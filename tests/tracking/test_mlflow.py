@@ -126,7 +126,9 @@ def finished(runs_dir: Path) -> RunFolder:
 
 POINTS = {
     "train/loss": [(5, 3.0), (10, 2.0), (15, 1.0)],
-    **{"val/mIoU": [(10, 12.35)], "mIoU": [(0, 40.0)], "Var": [(0, 156.25)]},
+    "val/mIoU": [(10, 12.35)],
+    "mIoU": [(0, 40.0)],
+    "Var": [(0, 156.25)],
     "profile/iou_by_region": [(1, 25.0), (2, 50.0)],
 }
 

@@ -11,9 +11,16 @@ from rgbt.types import Sample
 
 RECIPE: dict[str, Any] = {
     **dict.fromkeys(("contrast_range", "saturation_range", "thermal_contrast_range"), (0.5, 1.5)),
-    **{"brightness_delta": 32.0, "hue_delta": 18, "colour_probability": 0.5, "colour": "intended"},
-    **{"sizes": (24, 30, 48, 61, 96), "max_size": 192, "crop_hw": (24, 32)},
-    **{"flip_probability": 0.5, "test_short_edge": None, "track_position": True},
+    "brightness_delta": 32.0,
+    "hue_delta": 18,
+    "colour_probability": 0.5,
+    "colour": "intended",
+    "sizes": (24, 30, 48, 61, 96),
+    "max_size": 192,
+    "crop_hw": (24, 32),
+    "flip_probability": 0.5,
+    "test_short_edge": None,
+    "track_position": True,
 }
 SIZES = ((48, 64), (60, 50), (31, 77), (97, 41), (64, 128), (33, 200))
 

@@ -78,8 +78,11 @@ def test_a_window_is_the_whole_cut(hw: tuple[int, int]) -> None:
 
 def test_padding_and_flip_by_hand() -> None:
     small = Sample(
-        *(np.full((1, 2, 3), 9, np.uint8), np.array([[1, 2]], np.uint8)),
-        *(np.array([[3, 4]], np.uint8), "x", np.array([[0.25, 0.75]], np.float32)),
+        np.full((1, 2, 3), 9, np.uint8),
+        np.array([[1, 2]], np.uint8),
+        np.array([[3, 4]], np.uint8),
+        "x",
+        np.array([[0.25, 0.75]], np.float32),
     )
     found = Maps.of(small).flip(True).pad((2, 5), ((124, 116, 104), 114, 255, 0)).example(True)
     # One row more: below. Three columns more: one left, two right.

@@ -318,7 +318,10 @@ def test_evaluation_keeps_files_or_resizes_images_alone(name: str) -> None:
 
 PUBLISHED: dict[str, dict[str, Any]] = {
     "crm": {
-        **{"brightness_delta": 32, "hue_delta": 18, "max_size": 1920, "colour": "intended"},
+        "brightness_delta": 32,
+        "hue_delta": 18,
+        "max_size": 1920,
+        "colour": "intended",
         **dict.fromkeys(("contrast_range", "saturation_range"), [0.5, 1.5]),
         **dict.fromkeys(("flip_probability", "colour_probability"), 0.5),
         "thermal_contrast_range": [0.5, 1.5],
@@ -328,21 +331,31 @@ PUBLISHED: dict[str, dict[str, Any]] = {
     "cmx_released": {"factors": [0.5, 0.75, 1, 1.25, 1.5, 1.75], "flip_probability": 0.5},
     "cmnext_released": {
         **dict.fromkeys(("colour_probability", "blur_probability"), 0.2),
-        **{"flip_probability": 0.5, "blur_deviation": 0.8},
-        **{"colour_range": [0.5, 1.5], "scale_range": [0.5, 2.0]},
+        "flip_probability": 0.5,
+        "blur_deviation": 0.8,
+        "colour_range": [0.5, 1.5],
+        "scale_range": [0.5, 2.0],
     },
     "thesis": {"flip_probability": 0.5, "blur_probability": 0.0, "label_resize": "nearest"},
     "thesis_blur": {"blur_probability": 0.5},
     "thesis_released": {"label_resize": "bilinear"},
     "semseg": {
         **dict.fromkeys(("rotate_probability", "blur_probability", "flip_probability"), 0.5),
-        **{"scale_range": [0.5, 2.0], "rotate_degrees": 10, "blur_kernel": 5},
+        "scale_range": [0.5, 2.0],
+        "rotate_degrees": 10,
+        "blur_kernel": 5,
     },
     "heatnet": {
         **dict.fromkeys(("flip_probability", "rotate_probability", "drop_probability"), 0.5),
-        **{"resize_hw": [320, 704], "crop_hw": [320, 640], "side_margin": 2},
-        **{"drop_height": [100, 300], "drop_width": [100, 500], "rotate_degrees": 20},
-        **{"thermal_probability": 0.5, "class_probability": 0.0, "thermal_range": [0.1, 1.0]},
+        "resize_hw": [320, 704],
+        "crop_hw": [320, 640],
+        "side_margin": 2,
+        "drop_height": [100, 300],
+        "drop_width": [100, 500],
+        "rotate_degrees": 20,
+        "thermal_probability": 0.5,
+        "class_probability": 0.0,
+        "thermal_range": [0.1, 1.0],
     },
 }
 

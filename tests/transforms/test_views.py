@@ -21,14 +21,24 @@ from rgbt.types import IGNORE, Batch
 from tests.geometry.views import RELEASED as CAMERA
 
 PAPER: dict[str, Any] = {
-    **{"camera": CAMERA, "yaw": (-10.0, 10.0), "pitch": (-10.0, 10.0), "roll": (-5.0, 5.0)},
-    **{"order": "zyx", "angles": "uniform", "mode": "both", "rectangle": "largest"},
-    **{"resampling": "once", "outside": "ignore"},
+    "camera": CAMERA,
+    "yaw": (-10.0, 10.0),
+    "pitch": (-10.0, 10.0),
+    "roll": (-5.0, 5.0),
+    "order": "zyx",
+    "angles": "uniform",
+    "mode": "both",
+    "rectangle": "largest",
+    "resampling": "once",
+    "outside": "ignore",
 }
 RELEASED = {
     **PAPER,
-    **{"order": "zxy", "angles": "integer", "rectangle": "corners"},
-    **{"resampling": "twice", "outside": "background"},
+    "order": "zxy",
+    "angles": "integer",
+    "rectangle": "corners",
+    "resampling": "twice",
+    "outside": "background",
 }
 HW = (96, 128)
 
@@ -234,12 +244,19 @@ def test_the_mark_tells_views_apart_by_what_they_show(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    **{"empty": b"", "no triple": b"yaw,pitch,roll\n", "no header": b"1,2,3\n"},
-    **{"order": b"roll,pitch,yaw\n1,2,3\n", "two values": b"yaw,pitch,roll\n1,2\n"},
-    **{"four values": b"yaw,pitch,roll\n1,2,3,4\n", "a word": b"yaw,pitch,roll\n1,2,x\n"},
-    **{"nan": b"yaw,pitch,roll\n1,2,nan\n", "endless": b"yaw,pitch,roll\n0,0,0\ninf,2,3\n"},
-    **{"too steep": b"yaw,pitch,roll\n0,0,0\n80,2,3\n", "bytes": b"\xff\xfe\x00\x01" * 9},
-    **{"ragged": b"yaw,pitch,roll\n1,2,3\n1,2\n", "utf-16": "1,2,3\n".encode("utf-16")},
+    "empty": b"",
+    "no triple": b"yaw,pitch,roll\n",
+    "no header": b"1,2,3\n",
+    "order": b"roll,pitch,yaw\n1,2,3\n",
+    "two values": b"yaw,pitch,roll\n1,2\n",
+    "four values": b"yaw,pitch,roll\n1,2,3,4\n",
+    "a word": b"yaw,pitch,roll\n1,2,x\n",
+    "nan": b"yaw,pitch,roll\n1,2,nan\n",
+    "endless": b"yaw,pitch,roll\n0,0,0\ninf,2,3\n",
+    "too steep": b"yaw,pitch,roll\n0,0,0\n80,2,3\n",
+    "bytes": b"\xff\xfe\x00\x01" * 9,
+    "ragged": b"yaw,pitch,roll\n1,2,3\n1,2\n",
+    "utf-16": "1,2,3\n".encode("utf-16"),
 }
 
 

@@ -158,7 +158,7 @@ def test_seeds_of_two_methods_are_not_paired() -> None:
     of_images = (looped(b, "mIoU") - looped(a, "mIoU")).std() * math.sqrt(40 / 39), 39
     errors = [(scores(each).std(ddof=1) / math.sqrt(len(each)), len(each) - 1) for each in (a, b)]
     of_seeds = welch(*errors)
-    ways = (welch(of_images, *[of_seeds]), of_seeds)
+    ways = (welch(of_images, of_seeds), of_seeds)
     half = max(stats.t.ppf(0.975, freedom) * error for error, freedom in ways)
     difference = scores(b).mean() - scores(a).mean()
     ends = [found.difference.both.low, found.difference.both.high]

@@ -71,11 +71,21 @@ def external(checkout: Path, *, inputs: str = "unit", **changes: Any) -> Externa
     node = compose([f"model/inputs={inputs}", "model=mfnet_tiny"]).model.inputs
     kinds = {key: value for key, value in node.items() if key != "_target_"}
     plain = {
-        **{"num_classes": 3, "checkout": str(checkout), "root": "."},
-        **{"constructor": "model.net:Net", "arguments": {"n_class": 3}, "namespaces": {}},
-        **{"feed": "stacked", "multiple": 1, "size_hw": None, "scores": ((),)},
-        **{"train_scores": None, "auxiliary": None, "resize": False, "one_by_one": False},
-        **{"weights_prefix": ""},
+        "num_classes": 3,
+        "checkout": str(checkout),
+        "root": ".",
+        "constructor": "model.net:Net",
+        "arguments": {"n_class": 3},
+        "namespaces": {},
+        "feed": "stacked",
+        "multiple": 1,
+        "size_hw": None,
+        "scores": ((),),
+        "train_scores": None,
+        "auxiliary": None,
+        "resize": False,
+        "one_by_one": False,
+        "weights_prefix": "",
     }
     return ExternalNetwork(**{**plain, **changes}, inputs=Inputs(**kinds))
 

@@ -124,3 +124,12 @@ def test_latex_escapes_and_omits_differences() -> None:
     assert r"a\_1 & ours & 3 & \_50.00 ± 10.00 \\" in text
     assert "difference" not in text
     assert r"50\% of A\_b \{c\}" in latex(grid(wide(caption=r"50% of A_b {c}")))
+
+
+def test_different_lists_of_rows_are_said() -> None:
+    scored = Made(ROWS).scored()
+    same = grid(replace(scored, lists={"a_1": "trained on train", "b": "trained on train"}))
+    assert "Lists of our rows: trained on train." in same.notes
+    notes = grid(replace(scored, lists={"a_1": "trained on train", "b": "trained on all"})).notes
+    said = "Our rows have different lists: trained on train (a_1); trained on all (b)."
+    assert said in notes

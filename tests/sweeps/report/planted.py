@@ -18,9 +18,16 @@ from sweeps.worker.planner import Planner
 from tests.sweeps.verdicts.accuracies import accuracy
 
 PROVENANCE = {
-    **{"started": "2026-01-01T00:00:00+00:00", "command": "/home/me/python -m rgbt.run seed=0"},
-    **{"git_commit": "0123456789abcdef", "git_dirty": False, "python": "3.11.7", "gpus": []},
-    **{"host": "desk", "cpu": "EPYC", "cpu_usable": 2, "packages": {"torch": "2.0"}},
+    "started": "2026-01-01T00:00:00+00:00",
+    "command": "/home/me/python -m rgbt.run seed=0",
+    "git_commit": "0123456789abcdef",
+    "git_dirty": False,
+    "python": "3.11.7",
+    "gpus": [],
+    "host": "desk",
+    "cpu": "EPYC",
+    "cpu_usable": 2,
+    "packages": {"torch": "2.0"},
 }
 
 

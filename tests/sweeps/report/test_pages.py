@@ -15,6 +15,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+import yaml
 
 from analysis.archive import add
 from rgbt.checks import InputError
@@ -55,6 +56,9 @@ def place(tmp_path_factory: pytest.TempPathFactory, composed_once: None) -> Path
     folder = tmp_path_factory.mktemp("report")
     (folder / "tables" / "my").mkdir(parents=True)
     (folder / "tables" / "my" / "planted.yaml").write_text(OWN)
+    (folder / "tables" / "without").mkdir()
+    without = {**yaml.safe_load(OWN), "paper": "without", "claims": []}
+    (folder / "tables" / "without" / "claims.yaml").write_text(yaml.safe_dump(without))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         plant(folder / "runs", "my/planted", SHARES)
@@ -310,7 +314,7 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
     code, said, err = call(entry, *words)
     assert code == 0, err
     assert {path.stem for path in out.glob("*.md")} == {
-        *("index", "claims", "networks", "studies", "my", "measurements", *PAPERS)
+        *("index", "claims", "networks", "studies", "my", "without", "measurements", *PAPERS)
     }
     found = {path.name for path in out.glob("*.svg")}
     assert {"my-planted_demo.svg", "spatialseg-table3_bench-20e4b0.svg"} <= found

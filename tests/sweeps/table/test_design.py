@@ -111,8 +111,12 @@ def test_half_fraction_has_the_product_as_last_level() -> None:
 def test_half_fraction_mixes_pairs_of_interactions_alone() -> None:
     # I = OCNS, so OC = NS, ON = CS and CN = OS.
     assert design({"S": "OCN"}).effects("trained") == {
-        **{"o": {"O": 1}, "c": {"C": 1}, "n": {"N": 1}, "s": {"S": 1}},
-        **{"o x c + n x s": {"OC": 1, "NS": 1}, "o x n + c x s": {"ON": 1, "CS": 1}},
+        "o": {"O": 1},
+        "c": {"C": 1},
+        "n": {"N": 1},
+        "s": {"S": 1},
+        "o x c + n x s": {"OC": 1, "NS": 1},
+        "o x n + c x s": {"ON": 1, "CS": 1},
         "o x s + c x n": {"OS": 1, "CN": 1},
     }
 

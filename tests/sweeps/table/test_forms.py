@@ -64,7 +64,9 @@ EXPECTED: dict[str, dict[str, str]] = {
     ),
     "crm/table2b": {"Ours": "Swin"},
     "crm/table3a": {
-        **{"(1)": "scheme", "(2)": CELLS, "(3)": "scheme.complementary_weight"},
+        "(1)": "scheme",
+        "(2)": CELLS,
+        "(3)": "scheme.complementary_weight",
         "(4)": "scheme.complementary_weight scheme.nonlocal_weight",
         "Ours": "scheme.complementary_weight",
     },
@@ -94,19 +96,23 @@ EXPECTED: dict[str, dict[str, str]] = {
     "spatialseg/table6": {"Edge": "loss.spatial.alpha", "Center": "loss.spatial.focus"},
     "spatialseg/table7": {
         **dict.fromkeys(("CMX", "CMNeXt", "CRM (Swin-T)"), ANOTHER),
-        **{"CRM": "Swin", "Ours": "Swin"},
+        "CRM": "Swin",
+        "Ours": "Swin",
         "Ours (Swin-T)": f"{OURS} masker.patch_size masker.ratio | {SIZES} {SMALLER}"
         f" // {OURS} masker.patch_size | {SIZES} {SMALLER}",
     },
     "spatialseg/table8": {
         **dict.fromkeys(("CMX", "CRM (Swin-T)"), ANOTHER),
-        **{"CRM": "Swin", "Ours": "Swin"},
+        "CRM": "Swin",
+        "Ours": "Swin",
         "Ours (Swin-T)": f"{OURS} masker.patch_size masker.ratio | {SMALLER} // {OURS} | {SMALLER}",
     },
     "temporal/table1": {
-        **{"(B)": FIRST_CON, "(C)": "loss.beta loss.second", "(F)": "loss.alpha loss.beta "},
+        "(B)": FIRST_CON,
+        "(C)": "loss.beta loss.second",
         **dict.fromkeys(("(D)", "(E)", "(H)", "(I)"), "loss.second"),
-        **{"(F)": "loss.alpha loss.beta loss.second", "(G)": "loss.beta loss.second"},
+        "(F)": "loss.alpha loss.beta loss.second",
+        "(G)": "loss.beta loss.second",
     },
     "temporal/table2": {
         "(B)": FIRST_CON,
@@ -117,8 +123,10 @@ EXPECTED: dict[str, dict[str, str]] = {
         **dict.fromkeys(("(D)", "(G)"), "loss.alpha loss.beta"),
     },
     "temporal/table4": {
-        **{"CMX (MiT-B2)": ANOTHER, "CMX (MiT-B4)": "| model.depths"},
-        **{"CMNeXt": ANOTHER, "Ours-dice": ANOTHER},
+        "CMX (MiT-B2)": ANOTHER,
+        "CMX (MiT-B4)": "| model.depths",
+        "CMNeXt": ANOTHER,
+        "Ours-dice": ANOTHER,
         **dict.fromkeys(("Ours-con", "Ours-con-acc"), "loss.second"),
     },
     "temporal/table5": {
@@ -143,14 +151,16 @@ EXPECTED: dict[str, dict[str, str]] = {
         "SH-Adv(Seg. on IR)": "model.weights",
         "Multi-head": f"{TWO_HEADS} model.weights | {SIZES}",
         "Multi-head*": f"{DECODER} model.weights | model.dropout",
-        **{"HeatNet*": ANOTHER, "RGB alone": ANOTHER},
+        "HeatNet*": ANOTHER,
+        "RGB alone": ANOTHER,
         "SH, first stage with labels on IR": "domains.source.view domains.target scheme",
         "Multi-head, first stage": f"{TWO_HEADS} | {SIZES}",
     },
     "multihead/table4": {
         "Multi-head*": f"{DECODER} model.weights | {SIZES} model.dropout",
         "Multi-head**": f"model.weights | {SIZES}",
-        **{"HeatNet RGB-only*": ANOTHER, "RGB by day alone": ANOTHER},
+        "HeatNet RGB-only*": ANOTHER,
+        "RGB by day alone": ANOTHER,
         "Multi-head, first stage": (
             "domains.source.head domains.source.view domains.target domains.target_is model.heads "
             f"scheme | {SIZES}"
@@ -403,8 +413,14 @@ NETWORKS = {
     row.network: name for name, table in TABLES.items() for row in table.rows if row.network
 }
 MILLIONS = {
-    **{"cmx_b2": 66.57, "cmx_b4": 139.86, "rtfnet_50": 185.24, "cmnext_b4": 116.56},
-    **{"rtfnet_152": 254.51, "heatnet": 54.36, "heatnet_rgb": 53.32, "mfnet": 0.735},
+    "cmx_b2": 66.57,
+    "cmx_b4": 139.86,
+    "rtfnet_50": 185.24,
+    "cmnext_b4": 116.56,
+    "rtfnet_152": 254.51,
+    "heatnet": 54.36,
+    "heatnet_rgb": 53.32,
+    "mfnet": 0.735,
 }
 """Parameters as the releases have them, with the classes of the data set."""
 

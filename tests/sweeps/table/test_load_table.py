@@ -62,8 +62,13 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
 
 
 ONE_CLAIM = {
-    **{"name": "c", "says": "", "source": "", "rows": ["small"], "against": ["large"]},
-    **{"columns": ["mIoU"], "expected": "higher"},
+    "name": "c",
+    "says": "",
+    "source": "",
+    "rows": ["small"],
+    "against": ["large"],
+    "columns": ["mIoU"],
+    "expected": "higher",
 }
 
 

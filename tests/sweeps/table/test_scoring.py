@@ -67,7 +67,10 @@ def test_score_omitted_rows_and_columns_have_no_cell() -> None:
     found = scored((ACC, RGB, LESS, mean), runs, rows)
     assert {place: cell.mean for place, cell in found.cells.items()} == {
         ("a", "acc"): 40.0,
-        **{("b", "acc"): 50.0, ("b", "rgb"): 30.0, ("b", "less"): -20.0, ("b", "both"): 40.0},
+        ("b", "acc"): 50.0,
+        ("b", "rgb"): 30.0,
+        ("b", "less"): -20.0,
+        ("b", "both"): 40.0,
     }
     assert published(rows[2], RGB) is None
     assert math.isnan(found.difference(rows[2], ACC))

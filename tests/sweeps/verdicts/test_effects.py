@@ -32,7 +32,9 @@ def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Ta
             DesignFactor(letter=name[0].upper(), name=name, **levels[name], **means) for name in NT
         ),
         methods=(baseline, DesignMethod(name="crm", experiment="crm", against="baseline")),
-        **{"outcomes": ("contrast",), "trained": trained, "tested": tested},  # type: ignore[arg-type]
+        outcomes=("contrast",),
+        trained=trained,
+        tested=tested,  # type: ignore[arg-type]
     )
     columns = (
         Column(name="one", metric="region/1"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -187,3 +188,18 @@ def test_claims_about_counted_sizes_are_exact() -> None:
         made = TableJudge("own/t", table(rows, (size,), claims=(one,)), sizes=given)
         assert made.judge(one, {}).word == word
     assert TableJudge("own/t", table(rows, (size,), claims=(one,))).judge(one, {}).word == "not run"
+
+
+def test_rows_of_different_lists_or_machines_are_said() -> None:
+    runs = planted({"low": SHARES["low"], "high": SHARES["high"]})
+    for (label, seed), each in runs.items():
+        lists = "trained on train.txt" if label == "low" else "trained on all.txt"
+        machine = "GPU" if label == "high" and seed else "CPU"
+        run = replace(each.results[0], lists=lists, machine=machine)  # type: ignore[type-var]
+        runs[label, seed] = replace(each, results=(run,))
+    basis = judge(claim(rows=("high",), against=("low",)), runs).basis
+    assert basis is not None
+    assert basis.warnings == (
+        "Different lists: low trained on train.txt; high trained on all.txt.",
+        "Seeds 1, 2 mix machines, which train differently.",
+    )

@@ -17,8 +17,13 @@ from sweeps.worker.progress import ProgressView, duration
 Make = Callable[[bool], io.StringIO]
 LABEL = "files=[/data/a] [red]not a colour[/red]"
 TRIAL: Any = SimpleNamespace(
-    **{"score": 0.4567, "done_share": 0.5, "seconds": 100.0, "status": "training", "number": 0},
-    **{"log": "runs/.logs/k.log", "plan": SimpleNamespace(point=Point(LABEL, ()))},
+    score=0.4567,
+    done_share=0.5,
+    seconds=100.0,
+    status="training",
+    number=0,
+    log="runs/.logs/k.log",
+    plan=SimpleNamespace(point=Point(LABEL, ())),
 )
 
 
