@@ -99,8 +99,8 @@ class StoredRuns:
             f"Different lists: {shown}." * (len(lists.keys() - {""}) > 1),
             f"Seeds {', '.join(mixed)} mix machines, which train differently." * bool(mixed),
         )
-        kinds = (" and ".join(sorted(values)) for values in (images, scales))
-        return Basis(*kinds, len(starts), tuple(filter(None, warnings)))
+        kind, scale = (" and ".join(sorted(values)) for values in (images, scales))
+        return Basis(kind, scale, len(starts), tuple(filter(None, warnings)))
 
 
 def _settings_of(run: RunResult) -> tuple[str, str, str, str, str]:
