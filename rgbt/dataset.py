@@ -97,7 +97,7 @@ class DatasetWrapper:
         self.source = source
 
     def __getattr__(self, key: str) -> Any:
-        if key == "source" or key.startswith("__"):  # of a copy that has no attributes yet
+        if key == "source" or key.startswith("__"):  # a copy has no attributes yet
             raise AttributeError(key)
         return getattr(self.source, key)
 

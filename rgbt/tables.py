@@ -38,7 +38,7 @@ class RegionTable:
 
     row_label: str  # method, e.g. "grbm (ours, seed 0)"
     region_ious: tuple[Score, ...]  # R mean IoUs, region 1 first
-    miou: Score  # of the whole image: pooled over regions
+    miou: Score  # whole image: pooled over regions
     variance: Score  # population variance over regions, squared percent points
 
 
@@ -50,7 +50,7 @@ class ClassTable:
     ious: tuple[Score, ...]  # over the whole image
     accuracies: tuple[Score, ...]  # recall
     region_ious: tuple[tuple[Score, ...], ...]  # K rows of R
-    subset_mious: Mapping[str, Score]  # of subsets of the images: {"day": 0.41, "night": 0.38}
+    subset_mious: Mapping[str, Score]  # subsets of the images: {"day": 0.41, "night": 0.38}
     unscored: tuple[str, ...] = ()  # classes that are left out of every mean
     notes: tuple[str, ...] = ()  # about absent classes (`rgbt.metrics.scores.absent_notes`)
 

@@ -174,7 +174,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
     node = spec.model.plain
     others = differences(node, plan.convention)
     noted, own = plan.inputs, node.get("inputs")
-    beside = source.parent / "config.yaml"  # of a checkpoint of a run
+    beside = source.parent / "config.yaml"  # where the file is a checkpoint of a run
     if noted is None and plan.is_own and beside.is_file():
         noted = read_settings(beside).get("model", {}).get("inputs")
     if not others and None not in (noted, own) and noted != own:

@@ -135,7 +135,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     model = fabric.setup_module(session.model)
     collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
     with torch.random.fork_rng(devices=[]):
-        seed = derive(session.drawn.weights, "scheme weights")  # of networks of its own
+        seed = derive(session.drawn.weights, "scheme weights")  # for networks of the scheme
         torch.manual_seed(seed)
         scheme: Any = spec.scheme.build(**collaborators, dataset=session.dataset)
     check_part("scheme", scheme)

@@ -11,7 +11,15 @@ from rgbt.checks import InputError, one_line
 if TYPE_CHECKING:  # --help waits for neither
     import pydantic
 
-KINDS = ("int", "float", "str", "bool", "dict", "list", "tuple")  # of a union, as pydantic names it
+KINDS = (
+    "int",
+    "float",
+    "str",
+    "bool",
+    "dict",
+    "list",
+    "tuple",
+)  # members of a union, as pydantic names them
 
 
 def check_value(path: str, value: Any, annotation: Any) -> Any:

@@ -119,7 +119,9 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             image.verify()
         image = Image.open(io.BytesIO(data), formats=FORMATS)
         image.load()
-        tags = getattr(image, "tag_v2", {})  # of a TIFF; the header of a PNG is its first chunk
+        tags = getattr(
+            image, "tag_v2", {}
+        )  # tags of a TIFF; the header of a PNG is its first chunk
         bits = data[24] if image.format == "PNG" else max(np.ravel(tags.get(258, 8)).tolist())
     except UNREADABLE as error:
         is_other = isinstance(error, UnidentifiedImageError)  # whose message has an address

@@ -45,13 +45,13 @@ class Manifest(TypedDict, total=False):
     label_map: dict[str, Any] | None  # num_source, targets, groups; None: none
     threshold: float
     dataset: str
-    fingerprint: str  # of the data set
+    fingerprint: str  # fingerprint of the data set
     split: str
     classes: Required[list[str]]  # their names, in order of their ids
     images: int  # how many
     skipped: list[str]  # unreadable ones
     kept: float  # share of pixels with a label
-    mean_confidence: float  # of all pixels
+    mean_confidence: float  # mean over all pixels
     by_class: dict[str, dict[str, float | None]]  # share of pixels, mean_confidence of those
     digest: Required[str]  # SHA-256 over names, labels and confidences
 

@@ -38,7 +38,7 @@ from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 StepData = Batch | TwoDomains
 Values = dict[str, float]
 
-WAIT_SHARE = "wait_share"  # of the time of a step, spent waiting for its images
+WAIT_SHARE = "wait_share"  # share of a step spent waiting for its images
 ADVICE = "Lower optimizer.lr, or set trainer.precision=32-true; the last checkpoint is kept."
 
 

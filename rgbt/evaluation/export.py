@@ -47,7 +47,7 @@ class ExportRequest:
     image_hw: Hw | None  # None: the size of the images after the transform
     split: str  # whose images are compared
     num_images: int  # how many of them, the first ones
-    tolerance: float  # of `Comparison.check`
+    tolerance: float  # see `Comparison.check`
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rgbt.data.new_images import ToPredict
     from rgbt.metrics.details import Details
 
-DEFAULT_VIEW, BEST = "default", "best"  # of the options `modality` and `checkpoint`
+DEFAULT_VIEW, BEST = "default", "best"  # values of the options `modality` and `checkpoint`
 CHANGES = ("transform", "trainer.precision", "metric", "prediction")  # the counts or scores
 
 

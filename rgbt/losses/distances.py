@@ -80,7 +80,7 @@ class FeatureDistance:
     Cityscapes from traffic light, traffic sign and person to bicycle.
     """
 
-    weight: Positive  # of the distance in the loss; released: 0.005
+    weight: Positive  # factor of the distance in the loss; released: 0.005
     things: Annotated[Names, Len(1, 255)]  # names of the thing classes in the data set
     min_share: Annotated[float, Interval(gt=0.5, le=1)]  # see `thing_cells`; released: 0.75
 

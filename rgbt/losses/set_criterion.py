@@ -227,7 +227,7 @@ class Matches(NamedTuple):
     label: NDArray[np.int64]  # (G,), class of each target
     query: NDArray[np.int64]  # (S, G), matched to each target; -1: targets outnumber queries
     place: Tensor | slice  # which of the targets of all processes these are
-    num_targets: int  # of all processes
+    num_targets: int  # in all processes
 
 
 def targets_of(

@@ -38,11 +38,11 @@ class TemporalLoss:
     Released: alpha = beta = 1; X is dice, con or con_acc.
     """
 
-    segmentation: Loss  # of each frame by itself; paper and released: cross-entropy
+    segmentation: Loss  # loss of each frame; paper and release: cross-entropy
     alpha: NonNegative  # with 0, the Dice loss of the first frame is not computed
     beta: NonNegative  # 0 if and only if `second` is "none"
     second: Literal["none", "dice", "con", "con_acc"]  # X: of the second frame, or of both
-    form: Form  # of dice, con and con_acc
+    form: Form  # which form of dice, con and con_acc
 
     def __post_init__(self) -> None:
         if (self.second == "none") == bool(self.beta):

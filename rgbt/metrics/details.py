@@ -36,7 +36,7 @@ KINDS: tuple[DetailKind, ...] = get_args(DetailKind)
 BOTH, LABEL, PREDICTED = range(3)
 NUMBER, CORRECT, CONFIDENCE = range(3)
 SCENE_KINDS: tuple[DetailKind, ...] = ("distance", "size")  # need `rgbt.types.SceneMaps`
-WIDTH: Final = 0.02  # of a boundary, share of the image diagonal (Cheng et al., Sec. 4)
+WIDTH: Final = 0.02  # width of a boundary, share of the image diagonal (Cheng et al., Sec. 4)
 DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
     "boundary": (WIDTH,),
     "calibration": (15.0,),  # equal bins (Guo et al., ICML 2017, Sec. 5)

@@ -30,7 +30,7 @@ from rgbt.models.inputs import Inputs
 from rgbt.models.parts import ALL_KEPT, Keep, add_residual
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
 
-MAP_NORM_EPS = 1e-6  # of the thermal patch embeddings and after its stages; the RGB stream's: 1e-5
+MAP_NORM_EPS = 1e-6  # thermal patch embeddings and after its stages; RGB stream: 1e-5
 
 
 class PoolingGate(nn.Module):

@@ -34,7 +34,7 @@ class PSPNet(Network):
     The arguments are the keys of ``conf/model/heatnet.yaml``.
     """
 
-    multiple = 8  # of the encoder; the decoder doubles the size three times
+    multiple = 8  # stride of the encoder; the decoder doubles the size three times
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,

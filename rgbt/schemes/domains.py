@@ -21,7 +21,7 @@ from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Ph
 #                so that shared parameters are stepped twice
 Gradients = Literal["apart", "kept", "together"]
 
-WHOLE_IMAGES = Requirement("masker", "hides_cells", False)  # of a scheme without a masked pass
+WHOLE_IMAGES = Requirement("masker", "hides_cells", False)  # for schemes without a masked pass
 
 
 class ViewAndHead(Protocol):

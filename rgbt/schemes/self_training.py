@@ -29,8 +29,8 @@ TEACHER = "teacher"
 # and the mean of the highest probabilities.
 CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 
-NUM_VALUES = 256  # of a label: the classes and 255, which is pasted like a class
-LUMA = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
+NUM_VALUES = 256  # values of a label: the classes and 255, which is pasted like a class
+LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue (ITU-R BT.601)
 Normalisation = Literal["batch", "running"]
 
 
@@ -46,7 +46,7 @@ class Teacher:
 
     def __init__(self, network: nn.Module, *, decay: float, normalisation: Normalisation) -> None:
         self.average = AveragedNetwork(network, buffers=False)
-        self._student = (network,)  # of which it is no part
+        self._student = (network,)  # a tuple, so that it is no submodule
         self._decay, self._normalisation = decay, normalisation
         self._step: int | None = None
 

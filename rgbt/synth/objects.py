@@ -110,7 +110,7 @@ def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Place
         depth = factors.bump_farthest_m - factors.bump_nearest_m
         z, lateral = factors.bump_nearest_m + depth * u[5] ** 1.3, -road.half_width / 2
         size, yaw = (road.half_width - 0.2, 1.0, 1.0), road.heading(z)
-        if u[6] < 0.6:  # of both lanes
+        if u[6] < 0.6:  # both lanes
             size, lateral = (2 * road.half_width - 0.3, 1.0, 1.0), 0.0
         bump = road.place("bump", z, lateral, yaw=yaw, scale=size, layer=GROUND)
         placed.append(bump._replace(shadow_from=NO_SHADOW))

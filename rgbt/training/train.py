@@ -93,7 +93,7 @@ class Training:
         self.spec, self.upstream_of = spec, upstream_of
         self.description = describe(spec, extra_tags)
         self._is_first = True
-        self._selected: dict[str, Counts] = {}  # of the last evaluation during the training
+        self._selected: dict[str, Counts] = {}  # counts of the last evaluation in training
 
     @alone()
     def validate(self) -> None:

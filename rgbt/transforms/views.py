@@ -204,7 +204,7 @@ def read_angles(name: str) -> Tensor:
     try:
         header, *lines = read_bytes(path).decode("utf-8-sig").replace(" ", "").split() or [""]
         triples = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, 0))
-    except ValueError as error:  # of the encoding, too
+    except ValueError as error:  # also a wrong encoding
         raise InputError(f"consistency.sets: {path}: {error}") from error
     if header != "yaw,pitch,roll" or triples.shape[1] != 3 or not np.isfinite(triples).all():
         lines_of = "the line yaw,pitch,roll, then three finite numbers (degrees) per line"

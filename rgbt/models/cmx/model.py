@@ -34,10 +34,10 @@ STREAMS = ("", "extra_")  # before the names of the modules: RGB, and the other 
 class Stream(NamedTuple):
     """What one stream is made of."""
 
-    in_channels: int  # of the image
+    in_channels: int  # channels of the image
     block: Callable[[int], nn.Module]  # makes a block of stage 0..3
-    embed_eps: float  # of the normalisations in patch embeddings
-    norm_eps: float  # of the normalisations after a stage
+    embed_eps: float  # epsilon of the normalisations in patch embeddings
+    norm_eps: float  # epsilon of the normalisations after a stage
 
 
 class CmxEncoder(nn.Module):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-GROUPS = 32  # of every group normalisation (Mask2Former release)
+GROUPS = 32  # groups of every normalisation (Mask2Former release)
 NUM_LEVELS = 3
 POINTS = 4  # sampled per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)
 
@@ -51,7 +51,7 @@ class PixelPyramid(NamedTuple):
     weight: Tensor  # W, (C, C)
     bias: Tensor  # b, (C,)
     tokens: tuple[Tensor, ...]  # (B, S_l, C) at strides 32, 16, 8, row-major
-    levels: Levels  # of these three
+    levels: Levels  # levels of the three maps
 
 
 @lru_cache(maxsize=64)

@@ -37,7 +37,7 @@ RECORD = Record(
         "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
         "sem_seg_head.predictor.transformer_*_layers.*",
     ),
-)  # of every such network, without its backbone
+)  # every such network, without its backbone
 
 Widths = tuple[int, int, int, int]
 # (N, C_s, H/s, W/s), s = 4, 8, 16, 32.
