@@ -48,6 +48,7 @@ class Queue:
     plans: Sequence[TablePlan]
     runs: RunStore
     planner: Planner
+    is_dry: bool = False
     claims: int = 0
     decided: int = 0
     machine: str = field(default_factory=lambda: machine_name(machine()))
@@ -63,12 +64,12 @@ class Queue:
     def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
         """The next seeds of open claims, given all points in their order.
 
-        It adds new finished runs to the archive.
+        It adds new finished runs to the archive, unless it `is_dry`.
         """
         finished = {n for n, outcome in enumerate(outcomes) if outcome.state == "finished"}
         for outcome in (outcomes[place] for place in finished - self._seen):
             for result in filter(self.runs.is_own, outcome.results):
-                if self.runs.archive is not None:
+                if self.runs.archive is not None and not self.is_dry:
                     add(result, self.runs.archive)
             if outcome.seconds is not None:
                 self._seconds[self._network(outcome.point)].append(outcome.seconds)
@@ -163,7 +164,7 @@ def run_queue(
             info(f"{name} is left out: {error}")
     if not plans:
         raise InputError(f"table={options.table}: none of them can be trained.")
-    queue, title = Queue(plans, runs, planner), f"tables {options.scale}"
+    queue, title = Queue(plans, runs, planner, options.dry_run), f"tables {options.scale}"
     points = PointList(
         title, title, "list", queue.points, runs, planner.base, more=queue.more, rank=queue.rank
     )

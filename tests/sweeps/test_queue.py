@@ -149,6 +149,9 @@ def test_dry_run_prints_the_order_with_minutes(
     assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
     assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
     assert not (place / "runs").exists()
+    run(place, archive=None)
+    run(place, dry_run=True)
+    assert not (place / "results").exists(), "nothing is added"
 
 
 def test_a_table_with_runs_of_another_machine_waits(
