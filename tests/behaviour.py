@@ -36,7 +36,7 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf/experiment").glob("*.ya
 
 TEN_STEPS = [
     *("+debug=smoke", "trainer.max_steps=10", "trainer.log_every=1", "trainer.eval_every=10"),
-    *("trainer.checkpoint_every=10", "trainer.accelerator=cpu", "trainer.threads=2"),
+    *("trainer.checkpoint_every=10", "trainer.accelerator=cpu", "trainer.threads=1"),
     "tracking=none",
 ]
 """Overrides of the runs that are recorded. Upstream runs get the same number of steps."""
