@@ -165,15 +165,12 @@ def run_queue(
         raise InputError(f"table={options.table}: none of them can be trained.")
     queue, title = Queue(plans, runs, planner), f"tables {options.scale}"
     points = PointList(
-        title, title, "list", queue.points, runs, planner.base, more=queue.more, rank=queue.rank
+        title, title, "list", queue.points, runs, planner, more=queue.more, rank=queue.rank
     )
+    outcomes = (preview_points if options.dry_run else run_points)(points, settings)
+    queue.more(outcomes)
     if options.dry_run:
-        outcomes = preview_points(points, settings, planner)
-        queue.more(outcomes)
         print_rich(rich_table(queue.preview(outcomes)))
-    else:
-        outcomes = run_points(points, settings, planner)
-        queue.more(outcomes)
     states = Counter(outcome.state for outcome in outcomes)
     info(
         f"{states['finished']} of {len(outcomes)} runs are finished, {states['failed']} failed; "

@@ -223,11 +223,6 @@ def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) ->
     return TextTable(title, tuple(new or old for old, new in columns.items()), cells)
 
 
-def trials_csv(data: StudyData) -> str:
-    """All trials that count, one line each, numbers in full."""
-    return str(data.frame.drop(columns="key").to_csv(index=False))
-
-
 def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     """Print the tables of a study in the storage `url`, and write its files into `out`."""
     from rich.console import Group
@@ -251,7 +246,8 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
         *remarks,
     ]
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
-    write_atomic(out / "trials.csv", trials_csv(data).encode())
+    every = data.frame.drop(columns="key").to_csv(index=False)
+    write_atomic(out / "trials.csv", every.encode())
     print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
     lines = [("report", str(out / "study.md"))]
     if find_spec("optuna_dashboard"):

@@ -84,7 +84,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     tags = {f"rgbt.study/{name}": "grid"}
     points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
     kind = "list" if settings.points else "grid"
-    _grid(PointList(name, name, kind, points, runs, tuple(base)), settings)
+    _grid(PointList(name, name, kind, points, runs, Planner(base)), settings)
 
 
 def _label(point: Point) -> str:

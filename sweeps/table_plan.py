@@ -155,7 +155,6 @@ class TablePlan:
     request: TableRequest
     judge: TableJudge
     points: PointList
-    planner: Planner
     until_decided: SeedsUntilDecided | None
     rows: Sequence[ExternalRow]
     external: dict[CellRunId, Outcome]
@@ -164,7 +163,7 @@ class TablePlan:
         """Count the rows that are not trained; InputError: a path that does not fit its row."""
         for row in self.rows:
             runs_dir = self.points.runs.runs_dir
-            run = ExternalRun.of(row, self.request, self.points.base, runs_dir)
+            run = ExternalRun.of(row, self.request, self.points.planner.base, runs_dir)
             outcome = run.outcome(self.request.table, trust)
             if outcome.state == "failed":
                 raise InputError(f"row '{row.label}': {outcome.reason}")
@@ -212,5 +211,5 @@ def plan_table(
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
     title, points = f"{name} scale={request.scale}", tuple(request.points())
-    planned = PointList(f"table/{name}", title, "list", points, runs, planner.base, more)
-    return TablePlan(request, judge, planned, planner, more, rows, external)
+    planned = PointList(f"table/{name}", title, "list", points, runs, planner, more)
+    return TablePlan(request, judge, planned, more, rows, external)

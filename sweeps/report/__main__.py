@@ -64,7 +64,7 @@ def main(options: Options, overrides: list[str]) -> int:
     for path, text in files.items():
         write_atomic(path, text.encode(errors="xmlcharrefreplace"))
     if options.format == "markdown":
-        images = report.images()
+        images = report.images
         for stale in {path.name for path in out.glob("*.svg")} - set(images):
             (out / stale).unlink()
         for name, content in images.items():

@@ -32,7 +32,6 @@ from sweeps.rendering.publish import drawn_of, grid_of, grids_of
 from sweeps.rendering.table import MARKDOWN
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.efficiency import million_parameters
-from sweeps.table.load_table import PUBLISHED
 from sweeps.table.request import TAG
 from sweeps.verdicts.stored import TableResult, TableResults
 from sweeps.worker.progress import duration
@@ -277,7 +276,7 @@ class Report:
         body = "".join(part if place % 2 else reader.render(part) for place, part in parts)
         body = body.replace("<table>", '<div class="scroll"><table>')
         body = body.replace("</table>", "</table></div>")
-        for name, content in self.images().items():
+        for name, content in self.images.items():
             address = f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
             body = body.replace(f'src="{name}"', f'src="{address}"')
         script = (TEMPLATES / "sort.js").read_text()
@@ -286,12 +285,9 @@ class Report:
         page = shell.get_template("page.html.j2")
         return page.render(body=body, script=script, hash=f"sha256-{digest}")
 
+    @cached_property  # a second drawing has another layout
     def images(self) -> dict[str, bytes]:
         """The figures of the pages that were made, as SVG by the names of their files."""
-        return self._images
-
-    @cached_property
-    def _images(self) -> dict[str, bytes]:  # a second drawing has another layout
         import tempfile
 
         from analysis.figures.plots import save
@@ -351,16 +347,9 @@ def _networks(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
             sizes.append((each["name"], f"`model={model}`", f"{million_parameters(words):.2f}"))
         weights += [(each["name"], file, f"<{address}>") for file, address in each["weights"]]
         tests.append((each["name"], ", ".join(f"`{test}`" for test in each["tests"])))
-    headers = (
-        ("network", "configuration", "million parameters"),
-        ("network", "file", "published at"),
-    )
     grids = {
-        "networks": TextTable("", headers[0], tuple(sizes)),
-        "weights": TextTable("", headers[1], tuple(weights)),
+        "networks": TextTable("", ("network", "configuration", "million parameters"), tuple(sizes)),
+        "weights": TextTable("", ("network", "file", "published at"), tuple(weights)),
         "tests": TextTable("", ("network", "test"), tuple(tests)),
     }
     return {name: markdown(grid) for name, grid in grids.items()}
-
-
-PAPERS = tuple(sorted(path.name for path in PUBLISHED.iterdir()))
