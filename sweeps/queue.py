@@ -20,8 +20,8 @@ from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps.point import Outcome, Point
 from sweeps.settings import SweepSettings
-from sweeps.table.load_table import study_names, table_names
 from sweeps.table.request import TAG, seed_of
+from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
 from sweeps.verdicts.judge import contrasts_of
 from sweeps.worker.planner import Planner

@@ -19,9 +19,8 @@ from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import PREVIOUS
 from sweeps.table.efficiency import network_sizes
 from sweeps.table.external import ExternalRow, ExternalRun, external_rows, row_named
-from sweeps.table.load_table import PUBLISHED, is_own, load_table, table_names, table_path
 from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
-from sweeps.table.table import Row, Table
+from sweeps.table.table import PUBLISHED, Row, Table, is_own, load_table, table_names, table_path
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from sweeps.worker.planner import Planner

@@ -304,9 +304,7 @@ class Report:
         Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
         the papers and ``count runs`` that of runs, ``cell TABLE COLUMN ROW`` a mean over seeds with
         its standard deviation, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
-
-        Raises:
-            InputError: a mark that names nothing.
+        InputError: a mark that names nothing.
         """
         return MARKED.sub(lambda mark: f"{mark[1]}{self._block(mark[2])}{mark[3]}", text)
 

@@ -175,11 +175,7 @@ def difference(row: str, other: str | None, column: str, minus: str | None = Non
 
 
 def base_scores(table: Table, row: Row, name: str) -> Iterator[tuple[float, Column]]:
-    """(weight, column) of the scores of counts that a column of a row is computed from.
-
-    Raises:
-        KeyError: the row has no such column.
-    """
+    """The scores that a column is computed from, with weights; KeyError: the row has no such."""
     columns = {column.name: column for column in table.columns_of(row)}
     column = columns[name]
     if not column.sources:
@@ -241,12 +237,7 @@ class JudgedClaim:
 class TableJudge:
     """Judges claims of one table; keeps counts and resampled scores between calls.
 
-    Attributes:
-        name: of the table.
-        rule: when a claim is decided.
-        resamples: of the images.
-        sizes: exact values of cells that are counted without a run.
-        stored: the runs that were read.
+    `rule` says when a claim is decided; `sizes` are cells that are counted without a run.
     """
 
     name: str
@@ -346,8 +337,7 @@ class TableJudge:
     def terms(self, cells: Sequence[Cell], runs: Mapping[CellRunId, Outcome]) -> list[Term]:
         """The scores of counts, by seed, that a weighted sum of cells is made of.
 
-        Raises:
-            InputError: a row without a finished run or the score, or rows of the same runs.
+        InputError: a row has no finished run or not the score, or the rows are the same runs.
         """
         found = [term for cell in cells for term in self._terms(cell, runs)]
         sums: dict[tuple[str, ...], float] = {}
