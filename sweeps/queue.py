@@ -51,7 +51,7 @@ class Queue:
     claims: int = 0
     decided: int = 0
     machine: str = field(default_factory=lambda: machine_name(machine()))
-    # By overrides.
+    # Worth of a run by its overrides; seconds of finished runs by their network.
     _worth: dict[tuple[str, ...], float] = field(default_factory=lambda: defaultdict(float))
     _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _seen: set[int] = field(default_factory=set)  # places of finished points

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     import optuna
     import pandas as pd
 
+# Optuna's states as shown.
 WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
 WORDS |= {"RUNNING": "running", "WAITING": "waiting"}
-"""Optuna's states as shown."""
 
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
@@ -146,8 +146,8 @@ def tables(data: StudyData) -> list[TextTable]:
 def trials_grid(data: StudyData) -> TextTable:
     """The most important trials with their parameters, scores and runs.
 
-    Of a search the best `TOP` by the objective, or the Pareto front of several; of a grid or list
-    the points in their order.
+    A search shows the best `TOP` by its objective, or the Pareto front of several objectives; a
+    grid or list shows its points in their order.
     """
     from sweeps.point import short_names
 
@@ -198,7 +198,7 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
             return float(-trial.values[place] if is_up else trial.values[place])
 
         if varied and complete[metric].nunique() > 1:
-            with warnings.catch_warnings():  # of the sign, and of few trials
+            with warnings.catch_warnings():  # about the sign, and about few trials
                 warnings.simplefilter("ignore")
                 found[metric] = get_param_importances(data.study, params=varied, target=loss)
     if not found:

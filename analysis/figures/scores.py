@@ -182,7 +182,7 @@ def corrupted(
         relative=("relative", "mean"),
         relative_sd=("relative", "std"),
     )
-    # What only some trainings of a method were measured at is not shown.
+    # Points at which only some trainings of a method were measured are not shown.
     return found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
 
 
@@ -308,7 +308,7 @@ def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
     plots.line_plot(axes, frame, styles, bars=is_crowded, spread=SPREAD * is_crowded)
     plots.region_axis(axes, frame["x"].max(), f"region ({frame['partition'][0]})")
     axes.set_ylabel("mIoU (%)")
-    # For example "95 % intervals over images and seeds", and their numbers below.
+    # The title says, for example, "95 % intervals over images and seeds", above their numbers.
     numbers = [
         f"{' or '.join(map(str, sorted(set(many))))} {word}{'' if set(many) == {1} else 's'}"
         for word, many in (("seed", methods["seeds"]), ("image", methods["images"]))

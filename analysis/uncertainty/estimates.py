@@ -212,7 +212,7 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     trainings = f"{found.a.seeds} and {found.b.seeds} trainings"
     if found.a.seeds == found.b.seeds:
         trainings = f"{found.a.seeds} trainings each" if found.a.seeds > 1 else "one training each"
-    # What was not drawn anew and may be all there is to the difference.
+    # Words for what was not drawn anew, which may be all there is to the difference.
     start, basis = "As trained here, ", f"over {images}; with {trainings}, it says nothing about"
     basis += " other trainings of the two"
     if difference.both is not None:

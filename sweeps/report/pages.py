@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).with_name("templates")
 STUDIES = "studies"
-# In the order in which a verdict counts more.
+# Scales in the order in which their verdicts count more.
 SCALES = ("smoke", "demo", "bench", "paper")
 
 # A path from the root of a machine; addresses of pages and relative paths do not match.
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 
-# What is no markup of ours, such as an element in a text of a run.
+# Beginning of markup that is not ours, such as an element in a text of a run.
 MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
 
 # Numbers in a page written by hand, between two comments.
@@ -55,7 +55,7 @@ MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL
 
 FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
-# What a record that somebody has edited may raise.
+# Errors that a record may raise that somebody has edited.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 
 
@@ -139,7 +139,7 @@ class Report:
         self.source, self.runs, self.studies = source, runs, studies.items()
         self.views = [TableView(result) for result in track(source)]
         self.every = claims_of(self.views)
-        # Of a claim the verdict by the most seeds at the largest scale counts.
+        # The verdict of a claim by the most seeds at the largest scale counts.
         ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
         order = self.every.assign(rank=ranks.fillna(-1)).sort_values(
             ["rank", "seeds"], kind="stable"

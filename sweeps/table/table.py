@@ -31,7 +31,8 @@ Form = Literal["paper", "released"]  # what a row is run as
 # Ending of the label of a row in its released form, beside the row of the paper's form.
 RELEASED = ", released"
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
+# Metrics of the most important columns of a table.
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
 
 
 @dataclass(frozen=True, kw_only=True)

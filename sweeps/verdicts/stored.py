@@ -73,7 +73,7 @@ def stored_runs(
             if run := finished.by_seed[seed].get(key):
                 runs[row.label, seed] = Outcome(Point(row.label, ()), "finished", results=(run,))
     if errors and len(errors) == len(rows):
-        raise errors[0]  # of the command, and not of a row
+        raise errors[0]  # the command is wrong, and not a row
     return runs
 
 
@@ -160,7 +160,7 @@ class TableResults:
             words = [each for each in run.description.overrides if not each.startswith("seed=")]
             scales = [each.removeprefix("scale=") for each in words if each.startswith("scale=")]
             scale = scales[-1] if scales else DEFAULT_SCALE
-            # Tables share runs: of one of them the row says what was typed beside its words.
+            # Tables share runs: the rows of one of them tell what else was typed.
             fitting = [
                 each for pair in tagged.items() for each in self._fitting(*pair, words, scale)
             ]

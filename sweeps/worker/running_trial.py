@@ -72,7 +72,7 @@ class RunningTrial:
         self._began = time.monotonic()
         self._job: LocalJob | None = None
         self._folder = Path()
-        self._size, self._step, self._validated = 0, 0, 0  # of the metrics of the present run
+        self._size, self._step, self._validated = 0, 0, 0  # metrics of the present run
         self._results: tuple[RunResult, ...] = ()
         self._end: Exception | None = None
         self._unreported: list[MetricLine] = []
