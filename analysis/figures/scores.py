@@ -77,8 +77,8 @@ def class_consistency(
 ) -> pd.DataFrame:
     """TC (value) and CA (low, by the union of the protocol) of variants by class, mean over seeds.
 
-    In percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the cells of
-    the paper's Table I. InputError: counts of single frames, or of different kinds.
+    Both are in percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the
+    cells of the paper's Table I. InputError: counts of single frames, or of different kinds.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
     reference, convened = check_same_images(every), absent or convention(every)

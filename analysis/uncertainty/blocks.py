@@ -238,7 +238,7 @@ def _automatic(
 
 
 def _range(pieces: Sequence[Places]) -> str:
-    """Their sizes, for example "2 to 20", or "10" where all are equal."""
+    """Sizes of the pieces, for example "2 to 20", or "10" where all are equal."""
     least, most = min(map(len, pieces)), max(map(len, pieces))
     return str(most) if least == most else f"{least} to {most}"
 

@@ -163,7 +163,7 @@ def compare(
 ) -> Comparison:
     """Compare two methods on the same images.
 
-    Of counts of one or more trainings of each, in the named metrics (`rgbt.metrics.named`).
+    `a` and `b` are counts of one or more trainings of each; `metrics` see `rgbt.metrics.named`.
     Seeds of two methods are not paired (Welch).
 
     Raises:
