@@ -199,7 +199,7 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
     arrays = {name: np.array(fields.pop(name)) for name in ("names", "classes")}
     arrays["night"] = np.array(fields.pop("night") or (), bool)
     arrays["unscored"] = np.array(fields.pop("unscored"), str)
-    # Of confusion matrices alone do the rows sum to the pixels of the label.
+    # Only the rows of confusion matrices sum to the pixels of the label.
     if details_of(counts.partition) is None and protocol_of(counts.partition) is None:
         arrays["labelled"] = array.sum(-1, dtype=np.int64)
         array = array.copy()

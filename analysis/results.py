@@ -57,7 +57,7 @@ COLUMNS = (
     *SCORE_COLUMNS,
 )
 
-# What a list may contain, for messages.
+# Words of messages for what a list may contain.
 RUNS = "runs, files of counts or a group"
 
 # Counts of single frames, or of pairs of frames by one protocol.

@@ -100,7 +100,7 @@ def main(options: Options, overrides: list[str]) -> int:
     remarks = [] if stats.background else [samples.no_background(stats)]
     sample = samples.Sample(stats, drawn, way)
     frame, found = samples.quantities(stats), judged(sample)
-    # Of the statements about noise those of the chosen estimator and average.
+    # Statements about noise are shown for the chosen estimator and average only.
     is_shown = (found["estimator"] == "") | (found["estimator"] + found["average"] == "".join(way))
     after = [tables.statement_table(found[is_shown], options.level), tables.estimator_table(found)]
     heading = f"{tables.heading(stats)}; intervals over {sample.blocks.said}"

@@ -1,9 +1,9 @@
 """Names of the user attributes of trials and studies in Optuna's storage."""
 
-# Of a trial
-KEY = "rgbt.key"  # of its point, see `PlannedPoint.key`
+# Attributes of a trial
+KEY = "rgbt.key"  # key of its point, see `PlannedPoint.key`
 RUNS = "rgbt.runs"  # keys of its runs, one per seed
-OVERRIDES = "rgbt.overrides"  # of `python -m rgbt.run`, without the seeds of replicates
+OVERRIDES = "rgbt.overrides"  # those of `python -m rgbt.run`, without the seeds of replicates
 LABEL = "rgbt.label"  # the point as shown; written after the first heartbeat
 # Why it failed or was pruned. A failed one without it was lost, released or a duplicate: it does
 # not count.
@@ -12,8 +12,8 @@ SECONDS = "rgbt.seconds"  # duration of its runs, all processes together
 RESULTS = "rgbt.results"  # "val/..." and "test/..." scores, mean over its seeds; percent
 PIXELS = "rgbt.pixels"  # size of its images relative to the paper's, which scales ``${px:64}``
 
-# Of a study
+# Attributes of a study
 KIND = "rgbt.kind"  # "search", "grid" or "list"
 SIGNATURE = "rgbt.signature"  # hash of its space and objectives, which must not change
 METRICS = "rgbt.metrics"  # names of the objectives, in order
-COMMAND = "rgbt.command"  # that created it
+COMMAND = "rgbt.command"  # the command that created it

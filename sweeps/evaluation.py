@@ -83,16 +83,13 @@ class ExtraEvaluation:
         if self.frames is not None:
             return file_name(self.frames, "test")
         head = "" if self.head == "as trained" else f"{self.head}-head"
-        # By the overrides and not by the name, whose overrides may change.
+        # The overrides tell worlds apart, because those of a name may change.
         digest = hashlib.sha256("\n".join(self.dataset).encode()).hexdigest()[:8]
         world = f"world-{digest}" if self.dataset else ""
-        words = ("table", self.modality, self.regions.replace(" ", "-"), head, *self._changes)
-        return f"evaluations/{'_'.join(filter(None, (*words, world)))}.npz"
-
-    @property
-    def _changes(self) -> tuple[str, ...]:
-        """The corruption and the statistics of batch normalisation, as parts of a name."""
         severity = "" if self.severity is None else f"-{self.severity:g}"
         corruption = f"{row_name(self.corruption)}{severity}" if self.corruption else ""
         norm = "-".join(("norm", self.batch_norm, *self.batch_norm_splits))
-        return corruption, "" if self.batch_norm == "as trained" else norm
+        norm = "" if self.batch_norm == "as trained" else norm
+        regions = self.regions.replace(" ", "-")
+        words = ("table", self.modality, regions, head, corruption, norm, world)
+        return f"evaluations/{'_'.join(filter(None, words))}.npz"

@@ -34,7 +34,7 @@ def new(options: NewOptions, overrides: list[str]) -> int:
 
     Overrides with comma lists are the varied keys: masker.sigma_div=1,2,4 masker.patch_size=32,64
     """
-    from sweeps.table.load_table import OWN, load_table
+    from sweeps.table.table import OWN, load_table
 
     path = write_new(options.table, options.experiment, overrides, OWN)
     sys.stdout.write(
@@ -56,7 +56,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     from rgbt.files.atomic import write_atomic
     from sweeps.point import short_names
     from sweeps.space import grid_points, split
-    from sweeps.table.load_table import PUBLISHED
+    from sweeps.table.table import PUBLISHED
     from sweeps.worker.planner import specify_run
 
     path = folder / f"{name}.yaml"

@@ -20,8 +20,8 @@ from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps.point import Outcome, Point
 from sweeps.settings import SweepSettings
-from sweeps.table.load_table import study_names, table_names
 from sweeps.table.request import TAG, seed_of
+from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
 from sweeps.verdicts.judge import contrasts_of
 from sweeps.worker.planner import Planner
@@ -52,7 +52,7 @@ class Queue:
     claims: int = 0
     decided: int = 0
     machine: str = field(default_factory=lambda: machine_name(machine()))
-    # By overrides.
+    # Worth of a run by its overrides; seconds of finished runs by their network.
     _worth: dict[tuple[str, ...], float] = field(default_factory=lambda: defaultdict(float))
     _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _seen: set[int] = field(default_factory=set)  # places of finished points
@@ -166,15 +166,12 @@ def run_queue(
         raise InputError(f"table={options.table}: none of them can be trained.")
     queue, title = Queue(plans, runs, planner, options.dry_run), f"tables {options.scale}"
     points = PointList(
-        title, title, "list", queue.points, runs, planner.base, more=queue.more, rank=queue.rank
+        title, title, "list", queue.points, runs, planner, more=queue.more, rank=queue.rank
     )
+    outcomes = (preview_points if options.dry_run else run_points)(points, settings)
+    queue.more(outcomes)
     if options.dry_run:
-        outcomes = preview_points(points, settings, planner)
-        queue.more(outcomes)
         print_rich(rich_table(queue.preview(outcomes)))
-    else:
-        outcomes = run_points(points, settings, planner)
-        queue.more(outcomes)
     states = Counter(outcome.state for outcome in outcomes)
     info(
         f"{states['finished']} of {len(outcomes)} runs are finished, {states['failed']} failed; "

@@ -59,22 +59,6 @@ class Options:
     trust: Trust = ""
 
 
-# Options that are no settings of execution of that name.
-TABLE_OPTIONS = (
-    "table",
-    "seeds",
-    "max_seeds",
-    "scale",
-    "form",
-    "rows",
-    "runs_dir",
-    "out",
-    "fresh",
-    "minutes",
-    "archive",
-)
-
-
 def main(options: Options, overrides: list[str]) -> int:
     """Run the missing runs of a table and print our values beside the published ones.
 
@@ -102,16 +86,16 @@ def main(options: Options, overrides: list[str]) -> int:
         return run_queue(options, overrides, settings, runs, planner)
     plan = plan_table(options, overrides, runs, planner)
     if settings.dry_run:
-        outcomes = preview_points(plan.points, settings, plan.planner)
+        outcomes = preview_points(plan.points, settings)
         print_preview(plan, outcomes, settings.workers)
         return 0
     plan.evaluate_external(options.trust)
-    outcomes = run_points(plan.points, settings, plan.planner) if plan.points.points else []
+    outcomes = run_points(plan.points, settings) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result for each in outcomes for result in each.results)
     name = f"{plan.request.name}_{plan.request.variant}"
     out = options.out or options.runs_dir / "tables" / name
-    return publish_table(plan.judge, plan.request, outcomes, plan.external, out)
+    return publish_table(plan, outcomes, out)
 
 
 def settings_of(options: Options) -> SweepSettings:
@@ -127,7 +111,7 @@ def settings_of(options: Options) -> SweepSettings:
     node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
     node.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
-        if key not in TABLE_OPTIONS:
+        if key in node:
             node[key] = value
     try:
         return read_settings(node)

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     import optuna
     import pandas as pd
 
+# Optuna's states as shown.
 WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
 WORDS |= {"RUNNING": "running", "WAITING": "waiting"}
-"""Optuna's states as shown."""
 
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
@@ -146,8 +146,8 @@ def tables(data: StudyData) -> list[TextTable]:
 def trials_grid(data: StudyData) -> TextTable:
     """The most important trials with their parameters, scores and runs.
 
-    Of a search the best `TOP` by the objective, or the Pareto front of several; of a grid or list
-    the points in their order.
+    A search shows the best `TOP` by its objective, or the Pareto front of several objectives; a
+    grid or list shows its points in their order.
     """
     from sweeps.point import short_names
 
@@ -198,7 +198,7 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
             return float(-trial.values[place] if is_up else trial.values[place])
 
         if varied and complete[metric].nunique() > 1:
-            with warnings.catch_warnings():  # of the sign, and of few trials
+            with warnings.catch_warnings():  # about the sign, and about few trials
                 warnings.simplefilter("ignore")
                 found[metric] = get_param_importances(data.study, params=varied, target=loss)
     if not found:
@@ -221,11 +221,6 @@ def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) ->
     rows = frame[list(columns)].itertuples(index=False, name=None)
     cells = tuple(tuple(map(text, columns, row)) for row in rows)
     return TextTable(title, tuple(new or old for old, new in columns.items()), cells)
-
-
-def trials_csv(data: StudyData) -> str:
-    """All trials that count, one line each, numbers in full."""
-    return str(data.frame.drop(columns="key").to_csv(index=False))
 
 
 def publish_study(study: optuna.Study, out: Path, url: str) -> None:
@@ -251,7 +246,8 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
         *remarks,
     ]
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
-    write_atomic(out / "trials.csv", trials_csv(data).encode())
+    every = data.frame.drop(columns="key").to_csv(index=False)
+    write_atomic(out / "trials.csv", every.encode())
     print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
     lines = [("report", str(out / "study.md"))]
     if find_spec("optuna_dashboard"):

@@ -84,7 +84,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     tags = {f"rgbt.study/{name}": "grid"}
     points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
     kind = "list" if settings.points else "grid"
-    _grid(PointList(name, name, kind, points, runs, tuple(base)), settings)
+    _grid(PointList(name, name, kind, points, runs, Planner(base)), settings)
 
 
 def _label(point: Point) -> str:
@@ -110,11 +110,9 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
     else:
         # A typing error should not cost hours of other runs.
         outcomes = point_list.run_points(points, settings, strict=True)
-    is_begun = any(outcome.results for outcome in outcomes)
-    tables = [
-        *([group_grid(points.title, outcomes)] if is_begun else []),
-        unfinished_grid(outcomes),
-    ]
+    tables = [unfinished_grid(outcomes)]
+    if any(outcome.results for outcome in outcomes):
+        tables.insert(0, group_grid(points.title, outcomes))
     print_rich(Group(*(rich_table(each) for each in tables if each.rows)))
     if other_code := point_list.other_code_line(outcomes):
         info(other_code)

@@ -19,9 +19,8 @@ from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import PREVIOUS
 from sweeps.table.efficiency import network_sizes
 from sweeps.table.external import ExternalRow, ExternalRun, external_rows, row_named
-from sweeps.table.load_table import PUBLISHED, is_own, load_table, table_names, table_path
 from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
-from sweeps.table.table import Row, Table
+from sweeps.table.table import PUBLISHED, Row, Table, is_own, load_table, table_names, table_path
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from sweeps.worker.planner import Planner
@@ -155,7 +154,6 @@ class TablePlan:
     request: TableRequest
     judge: TableJudge
     points: PointList
-    planner: Planner
     until_decided: SeedsUntilDecided | None
     rows: Sequence[ExternalRow]
     external: dict[CellRunId, Outcome]
@@ -164,7 +162,7 @@ class TablePlan:
         """Count the rows that are not trained; InputError: a path that does not fit its row."""
         for row in self.rows:
             runs_dir = self.points.runs.runs_dir
-            run = ExternalRun.of(row, self.request, self.points.base, runs_dir)
+            run = ExternalRun.of(row, self.request, self.points.planner.base, runs_dir)
             outcome = run.outcome(self.request.table, trust)
             if outcome.state == "failed":
                 raise InputError(f"row '{row.label}': {outcome.reason}")
@@ -212,5 +210,5 @@ def plan_table(
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
     title, points = f"{name} scale={request.scale}", tuple(request.points())
-    planned = PointList(f"table/{name}", title, "list", points, runs, planner.base, more)
-    return TablePlan(request, judge, planned, planner, more, rows, external)
+    planned = PointList(f"table/{name}", title, "list", points, runs, planner, more)
+    return TablePlan(request, judge, planned, more, rows, external)

@@ -172,8 +172,9 @@ def panel(
 ) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
     """The pictures of a panel, one row per name: the figure, its axes, and the mIoU of each image.
 
-    In percent, over the scored classes that label or prediction hold, because a single image lacks
-    most classes. InputError: images without label or of several sizes, or a missing prediction.
+    The mIoU is in percent, over the scored classes that label or prediction hold, because a single
+    image lacks most classes. InputError: images without label or of several sizes, or a missing
+    prediction.
     """
     reader = PredictionReader(dataset.classes, dataset.palette, form)
     palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []

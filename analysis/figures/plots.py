@@ -33,7 +33,7 @@ COLUMN, PAGE = 3.4, 7.0
 # Points of numbers on small pictures, and of ticks, legends and other small letters.
 TINY, SMALL = 5.0, 7.0
 
-# Of labels and titles, on average.
+# Average number of letters in an inch of a label or a title.
 LETTERS_PER_INCH = 17
 
 # Letters whose room the line and the gap of a legend's entry take.
@@ -127,7 +127,7 @@ def line_plot(
         x = rows["x"] + spread * (index / max(1, len(groups) - 1) - 0.5)
         value, low, high = rows["value"], rows["low"], rows["high"]
         if bars:
-            # By a rounding error a value may lie outside its interval; no bar is negative.
+            # A rounding error may put a value outside its interval; no bar is negative.
             lengths = np.maximum([value - low, high - value], 0) if low.notna().any() else None
             axes.errorbar(x, value, lengths, **{"elinewidth": 0.7, **how})
             continue

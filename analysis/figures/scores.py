@@ -77,8 +77,8 @@ def class_consistency(
 ) -> pd.DataFrame:
     """TC (value) and CA (low, by the union of the protocol) of variants by class, mean over seeds.
 
-    In percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the cells of
-    the paper's Table I. InputError: counts of single frames, or of different kinds.
+    Both are in percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the
+    cells of the paper's Table I. InputError: counts of single frames, or of different kinds.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
     reference, convened = check_same_images(every), absent or convention(every)
@@ -182,7 +182,7 @@ def corrupted(
         relative=("relative", "mean"),
         relative_sd=("relative", "std"),
     )
-    # What only some trainings of a method were measured at is not shown.
+    # Points at which only some trainings of a method were measured are not shown.
     return found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
 
 
@@ -308,7 +308,7 @@ def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
     plots.line_plot(axes, frame, styles, bars=is_crowded, spread=SPREAD * is_crowded)
     plots.region_axis(axes, frame["x"].max(), f"region ({frame['partition'][0]})")
     axes.set_ylabel("mIoU (%)")
-    # For example "95 % intervals over images and seeds", and their numbers below.
+    # The title says, for example, "95 % intervals over images and seeds", above their numbers.
     numbers = [
         f"{' or '.join(map(str, sorted(set(many))))} {word}{'' if set(many) == {1} else 's'}"
         for word, many in (("seed", methods["seeds"]), ("image", methods["images"]))

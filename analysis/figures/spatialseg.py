@@ -55,7 +55,7 @@ SPREAD = 0.5
 # A logarithmic axis where one modality's median is more than this many times the other's.
 FAR_APART = 5.0
 
-# Of the bars of Figs. 5 and 6.
+# Resamples for the bars of Figs. 5 and 6.
 RESAMPLING = Resampling(resamples=2000)
 
 

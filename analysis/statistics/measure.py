@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from rgbt.checks import check_choice
 from rgbt.types import IGNORE, Sample
 
+# Ways to estimate the noise of Eq. 4, which the paper leaves open. The first is the default: it
+# uses every pixel, is unbiased for normal noise, and is fine-grained on 8-bit images.
+#
+# immerkaer: Immerkaer (1996), "Fast noise variance estimation": mean of |I * N| times
+#     sqrt(pi / 2) / 6. N is the difference of two Laplacians, which does not respond to planes and
+#     to straight edges along the axes.
+# wavelet_mad: Donoho and Johnstone (1994): median of the diagonal Haar coefficients |HH| over
+#     0.6745. Up to half of a region may be texture. `grouped_median` interpolates the median,
+#     because the median of whole numbers is coarse.
+# std: standard deviation of the pixel values of the region. All structure counts as noise. It is
+#     here because papers use it.
 ESTIMATORS = ("immerkaer", "wavelet_mad", "std")
-"""Ways to estimate the noise of Eq. 4, which the paper leaves open; the first is the default.
-
-immerkaer: Immerkaer (1996), "Fast noise variance estimation": mean of ``|I * N|`` times
-    ``sqrt(pi / 2) / 6``, with N the difference of two Laplacians, which is blind to planes and to
-    straight edges along the axes. The default: it uses every pixel, needs no constant, is unbiased
-    for normal noise, and stays fine-grained on 8-bit images.
-wavelet_mad: Donoho and Johnstone (1994): median of the diagonal Haar coefficients ``|HH|`` over
-    0.6745. Half of a region may be texture; but the median of few whole numbers is coarse, so it
-    is interpolated inside its bin (see `grouped_median`).
-std: standard deviation of the pixel values of the region. No noise estimate: all structure counts
-    as noise, and the ratio is the inverse coefficient of variation. Offered because papers use it.
-"""
 
 # Neighbours that the Laplacian reads. Four is the default: Pertuz et al., whom the paper cites
 # for this measure, and `cv2.Laplacian` use it by default.
@@ -149,7 +148,7 @@ class ImageMeter:
     def _immerkaer(self, image: Image) -> Floats:
         kernel = SECOND_DIFFERENCE
         response = np.abs(cv2.sepFilter2D(image, cv2.CV_16S, kernel, kernel)).astype(np.int32)
-        # As published, only where the mask fits into the image.
+        # The mask has to fit into the image, as published.
         response[[0, -1]] = 0
         response[:, [0, -1]] = 0
         with np.errstate(invalid="ignore"):
@@ -168,7 +167,7 @@ class ImageMeter:
         return median / 2 / MEDIAN_OF_NORMAL
 
 
-# Values of ``|a - b - c + d|`` of four bytes, which is twice the Haar coefficient HH.
+# Number of values of |a - b - c + d| of four bytes, which is twice the Haar coefficient HH.
 HAAR_BINS = 2 * 255 + 1
 
 

@@ -22,20 +22,19 @@ from rgbt.metrics.names import NIGHT
 # Eq. 4's "very small number", in grey levels.
 EPSILON = 1e-6
 
+# Ways to average the ratios of many images; the first is the default.
+#
+# pooled: mean signal of all images over mean noise of all images. A region that is flat in one
+#     image, with noise near 0, cannot decide the result.
+# images: mean of the ratios of the images.
 AVERAGES = ("pooled", "images")
-"""How ratios of many images become one; the first is the default.
 
-pooled: mean signal of all images over mean noise of all images. The default: a region that is flat
-    in one image, with noise near 0, cannot decide the result.
-images: mean over images of each image's own ratio.
-"""
-
-# Fewer blocks of day or night say too little about how blocks differ.
+# Least number of blocks of day or night: fewer say too little about how blocks differ.
 LEAST = 5
 
 COLUMNS = ["quantity", "modality", "class", "estimator", "average"]
 
-# Below with 1 + B rows: the sample, then its resamples.
+# Array with 1 + B rows: the sample, then its resamples.
 Values = NDArray[np.float64]
 
 
@@ -61,7 +60,7 @@ class Sample:
         check_choice("average", way[1], AVERAGES)
         self.stats, self.settings, self.way = stats, settings, way
         night = np.zeros(len(stats.names), bool) if stats.night is None else stats.night
-        # What tells how far neighbours are alike: objects, sharpness and brightness of an image.
+        # Objects, sharpness and brightness of an image tell how far neighbours are alike.
         measured = np.concatenate([stats.laplacian.mean(2), stats.mean.mean(2)], axis=1).T
         objects = stats.labels[..., ~stats.is_background].sum((1, 2))
         share = _ratio(objects, stats.labels.sum((1, 2)))

@@ -11,7 +11,7 @@ from analysis.commands import text_table
 from analysis.statistics.collect import ALL, SpatialStatistics
 from rgbt.tables import ABSENT, TextTable
 
-# More regions than this become rows.
+# Most regions that become columns; more become rows.
 WIDEST = 12
 
 CLASS_QUANTITIES = {

@@ -26,16 +26,16 @@ MOST = 1_000_000
 # Blocks below which an interval would rest on almost nothing.
 FEWEST = 10
 
-# Most numbers of one set of draws that is kept, as many scores need the same.
+# Most numbers in a set of draws that is kept, because many scores need the same draws.
 KEPT = 2**21
 
 # Resamples computed at once, which limits the memory that their counts take.
 CHUNK = 500
 
+# Number of typical steps between two frames above which the second one begins another run. In the
+# lists of MFNet neighbours are 1 or 3 numbers apart (a frame is left out), or at least 12. In those
+# of KP they are 1 or 2 steps of a recording (43 to 203 numbers) apart, or at least 7.
 GAP = 3.0
-"""Typical steps between frames of a sequence above which the next frame begins another run. In the
-lists of MFNet neighbours are 1 or 3 numbers apart (a frame left out) or at least 12; in those of KP
-1 or 2 steps of a recording (43 to 203 numbers), or at least 7."""
 
 ALONE = "each image is drawn alone, as if it were independent evidence"
 
@@ -180,8 +180,8 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
     Politis and White (2009). Their rule for the window looks at any lag, with a bound that at 100
     images passes over correlations of 0.28; this one is for frames.
 
-    Of an (N,) series of values of the images, and the places of the images of each sequence in the
-    order of their frames; at least 1.
+    `series` are (N,) values of the images, `sequences` the places of the images of each sequence in
+    the order of their frames. The length is 1 or more.
     """
     count = len(series)
     centred = series - series.mean()
@@ -238,7 +238,7 @@ def _automatic(
 
 
 def _range(pieces: Sequence[Places]) -> str:
-    """Their sizes, for example "2 to 20", or "10" where all are equal."""
+    """Sizes of the pieces, for example "2 to 20", or "10" where all are equal."""
     least, most = min(map(len, pieces)), max(map(len, pieces))
     return str(most) if least == most else f"{least} to {most}"
 

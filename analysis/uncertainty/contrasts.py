@@ -238,7 +238,7 @@ class Resampler:
 def watched(like: Counts) -> tuple[ParsedMetric, ...]:
     """Scores that tell how far neighbouring images are alike, whatever is requested: the main ones.
 
-    Of single frames also pixel accuracy, which shows likeness most clearly.
+    Single frames have pixel accuracy too, which shows likeness most clearly.
     """
     if details_of(like.partition) is not None:
         return tuple(map(parse, headlines(like)))

@@ -163,7 +163,7 @@ def compare(
 ) -> Comparison:
     """Compare two methods on the same images.
 
-    Of counts of one or more trainings of each, in the named metrics (`rgbt.metrics.named`).
+    `a` and `b` are counts of one or more trainings of each; `metrics` see `rgbt.metrics.named`.
     Seeds of two methods are not paired (Welch).
 
     Raises:
@@ -212,7 +212,7 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     trainings = f"{found.a.seeds} and {found.b.seeds} trainings"
     if found.a.seeds == found.b.seeds:
         trainings = f"{found.a.seeds} trainings each" if found.a.seeds > 1 else "one training each"
-    # What was not drawn anew and may be all there is to the difference.
+    # Words for what was not drawn anew, which may be all there is to the difference.
     start, basis = "As trained here, ", f"over {images}; with {trainings}, it says nothing about"
     basis += " other trainings of the two"
     if difference.both is not None:

@@ -42,9 +42,9 @@ def over_images(drawn: Values, *blocks: int) -> Spread | None:
     same holds for B blocks with images of the metric among more blocks: where all are drawn, the
     number of those B that are drawn varies by as much as makes up for it.
 
-    Of (resamples,) scores with B blocks drawn anew, of which NaN (nothing to score) is left out,
-    and B of each stratum of images, of which the smallest decides. None where there is nothing to
-    score, or a stratum has one block.
+    `drawn` are (resamples,) scores, of which NaN (nothing to score) is left out. `blocks` are B of
+    each stratum of images, of which the smallest decides. None where there is nothing to score, or
+    a stratum has one block.
     """
     known, least = drawn[~np.isnan(drawn)], min(blocks)
     if not known.size or least < 2:
@@ -106,9 +106,9 @@ def corrected(value: float, bias: float, spread: Spread, level: float) -> Interv
 
         value - bias -+ t error,  cut at 0,  and containing `value`
 
-    For the variance over regions: regions that are equally good in truth differ in a sample, so
-    that the estimate is too high by the mean error variance of their scores, and each resample is
-    too high by as much again (`bias`, the mean of the resamples less `value`).
+    The variance over regions needs it: regions that are equally good in truth differ in a sample,
+    so that the estimate is too high by the mean error variance of their scores, and each resample
+    is too high by as much again (`bias`, the mean of the resamples less `value`).
 
     Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), Sec. 5.2.1, with
     Student's quantile.

@@ -45,12 +45,12 @@ ONE_START = (
     "no difference hold with 3 seeds and 29 % with 5, and as many are contradicted."
 )
 
+# Precision of the prior over the effect size, whose standard deviation is 1 / sqrt(0.25) = 2. A
+# table of few seeds can show differences of about two standard deviations. At an alpha of 0.025
+# these need 7.1 seeds on average with a precision of 0.1 or 0.25, 7.3 with 0.5 and 7.9 with 1.
+# Differences of one standard deviation need 16.7 (0.1), 15.8 (0.25), 15.5 and 15.5 seeds
+# (tests/benchmarks/simulate_claims.py).
 PRECISION = 0.25
-"""Precision of the prior over the effect size: its standard deviation is ``1 / sqrt(0.25) = 2``.
-
-Differences that a table of few seeds can show are of about two standard deviations. At an alpha of
-0.025 these need 7.1 seeds on average with 0.1 and 0.25, 7.3 with 0.5 and 7.9 with 1. Differences of
-one standard deviation need 16.7, 15.8, 15.5 and 15.5 (`tests/benchmarks/simulate_claims.py`)."""
 
 
 def e_value(t: float, count: int, precision: float = PRECISION) -> float:

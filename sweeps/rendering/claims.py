@@ -22,7 +22,7 @@ NOTES = (
     "2.5 % are called holding. With seeds far from normal (lognormal, sd 1 of the logarithm) 14 to "
     "18 % of verdicts about no difference are wrong.",
 )
-# In the column of seeds: the difference of two evaluations without seeds.
+# Word in the column of seeds for a difference of two evaluations without seeds.
 IMAGES = "images alone"
 
 ALWAYS = (
@@ -45,7 +45,7 @@ NUMBERS = ("estimate", "low", "high", "smallest", "seeds_needed")
 # Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
 
-# Of a claim without a verdict.
+# Values of a claim without a verdict.
 WITHOUT: dict[str, Any] = dict.fromkeys(NUMBERS, math.nan)
 WITHOUT |= {"seeds": 0, "starts": 0}
 WITHOUT |= dict.fromkeys(("covers", "warning", "images", "scale", "start"), "")

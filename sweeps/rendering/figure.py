@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 OURS, PUBLISHED = "#0072B2", "#D55E00"
 DOTS: dict[str, Any] = {"fmt": "o", "ms": 5, "lw": 1, "capsize": 3, "ls": "none"}
 
-# Columns of a table without headlines, and headlines, that are shown.
+# Most columns that are shown of a table without headlines, and most headlines.
 MAX_PANELS, MAX_HEADLINES = 4, 5
 
 # Shift of published markers below ours, in rows.

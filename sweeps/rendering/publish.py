@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +19,6 @@ from sweeps.rendering.effects import effects_figure, effects_grids
 from sweeps.rendering.figure import figure_of
 from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 from sweeps.table.cells import NO_VALUE
-from sweeps.table.request import TableRequest
-from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.stored import TableResult
 from sweeps.worker.point_list import estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
@@ -34,29 +32,25 @@ STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
 
 
-def publish_table(
-    judge: TableJudge,
-    request: TableRequest,
-    outcomes: Sequence[Outcome],
-    external: Mapping[CellRunId, Outcome],
-    out: Path,
-) -> int:
-    """Print the table and its claims, and write its files into `out`; `external` are not trained.
+def publish_table(plan: TablePlan, outcomes: Sequence[Outcome], out: Path) -> int:
+    """Print the table and its claims, and write its files into `out`.
 
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs: dict[CellRunId, Outcome] = {**request.runs(outcomes), **external}
-    result = TableResult(request, runs, judge)
+    runs = {**plan.request.runs(outcomes), **plan.external}
+    result = TableResult(plan.request, runs, plan.judge)
     shown = grid_of(result, TERMINAL)
     claims = claims_frame(result.claims)
-    grids = [shown, *grids_of(result), *claim_grids(claims, noted=True)]
-    print_rich(Group(*map(rich_table, grids)))
+    effects = grids_of(result)
+    print_rich(Group(*map(rich_table, [shown, *effects, *claim_grids(claims, noted=True)])))
     failed = _report_missing(result, outcomes)
     if len(claims):
         print_rich(counted(claims))
+    parts = [grid.to_markdown() for grid in (grid_of(result, MARKDOWN), *effects)]
+    parts += [claims_markdown(claims)] if len(claims) else []
     texts = {
-        "table.md": markdown_of(result),
+        "table.md": "\n".join(parts),
         "table.csv": tidy_csv(result.scored),
         "table.tex": latex(shown),
     }
@@ -92,13 +86,6 @@ def grids_of(result: TableResult) -> list[TextTable]:
     """Effects of the design, if the table has one."""
     design = result.request.table.design
     return [] if result.effects is None or design is None else effects_grids(result.effects, design)
-
-
-def markdown_of(result: TableResult) -> str:
-    """The table, the effects and the claims in Markdown."""
-    parts = [grid.to_markdown() for grid in (grid_of(result, MARKDOWN), *grids_of(result))]
-    parts += [claims_markdown(claims_frame(result.claims))] if result.claims else []
-    return "\n".join(parts)
 
 
 def drawn_of(result: TableResult) -> Figure | None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import Value, over_seeds
+from sweeps.table.cells import over_seeds
 
 MOST_REGIONS = 99
 
@@ -32,13 +32,11 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     has_seeds = any(len(members) > 1 for members in groups.values())
     rows = []
     for label, members in groups.items():
-        cells = []
-        for metric in metrics:
-            values: dict[int, Value] = {
-                place: scores[id(each)].get(f"test/{metric}", each.reason or each.state)
-                for place, each in enumerate(members)
-            }
-            cells.append(over_seeds(values))
+        tested = [scores[id(each)] for each in members]
+        cells = [
+            over_seeds({n: each.get(f"test/{metric}", "not run") for n, each in enumerate(tested)})
+            for metric in metrics
+        ]
         count = cells[0].seeds
         seeds = f"{count} of {len(members)}" if count < len(members) else str(count)
         spreads = (f" ± {number(cell.sd)}" if cell.seeds > 1 else "" for cell in cells)

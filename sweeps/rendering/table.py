@@ -24,13 +24,13 @@ from sweeps.table.table import Column, Form, Row
 
 DOUBTFUL = "The printed value does not agree with the others of its row."
 NOT_PRINTED = "Not in the paper."
-# Of every scale but "paper".
+# Remark at every scale but "paper".
 SMALL = (
     "scale={scale}: data and network are small; compare the verdicts of the claims with the paper, "
     "not the values."
 )
 
-# Of tables that say nothing about their forms.
+# Remarks on tables that say nothing about their forms.
 FORMS: dict[Form, str] = {
     "paper": "Form: every row is run as the text of the paper describes it.",
     "released": "Form: no row of this table has a released form that differs from the text.",

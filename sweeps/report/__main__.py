@@ -64,7 +64,7 @@ def main(options: Options, overrides: list[str]) -> int:
     for path, text in files.items():
         write_atomic(path, text.encode(errors="xmlcharrefreplace"))
     if options.format == "markdown":
-        images = report.images()
+        images = report.images
         for stale in {path.name for path in out.glob("*.svg")} - set(images):
             (out / stale).unlink()
         for name, content in images.items():
@@ -87,16 +87,15 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -
     from analysis.results import finished_runs
     from rgbt.config.options import readable_paths
     from sweeps.report import pages
-    from sweeps.table.load_table import OWN
     from sweeps.verdicts.stored import FinishedRuns, TableResults, known_tables
     from sweeps.worker.planner import Planner
 
     runs = finished_runs(runs_dir, archive)
     planner = Planner(readable_paths([f"runs_dir={runs_dir}"]))
     remarks: list[str] = []
-    tables = known_tables(OWN, remarks)
-    finished = FinishedRuns(runs)
-    source = TableResults(finished, planner, tables, resamples, counted=counted, remarks=remarks)
+    source = TableResults(
+        FinishedRuns(runs), planner, known_tables(remarks), resamples, counted, remarks
+    )
     notes = {path.parent.name: path for path in sorted(runs_dir.glob("studies/*/study.md"))}
     studies = {name: path.read_text(errors="replace") for name, path in notes.items()}
     console = Console(stderr=True)

@@ -32,7 +32,6 @@ from sweeps.rendering.publish import drawn_of, grid_of, grids_of
 from sweeps.rendering.table import MARKDOWN
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.efficiency import million_parameters
-from sweeps.table.load_table import PUBLISHED
 from sweeps.table.request import TAG
 from sweeps.verdicts.stored import TableResult, TableResults
 from sweeps.worker.progress import duration
@@ -42,13 +41,13 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).with_name("templates")
 STUDIES = "studies"
-# In the order in which a verdict counts more.
+# Scales in the order in which their verdicts count more.
 SCALES = ("smoke", "demo", "bench", "paper")
 
 # A path from the root of a machine; addresses of pages and relative paths do not match.
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 
-# What is no markup of ours, such as an element in a text of a run.
+# Beginning of markup that is not ours, such as an element in a text of a run.
 MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
 
 # Numbers in a page written by hand, between two comments.
@@ -56,7 +55,7 @@ MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL
 
 FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
-# What a record that somebody has edited may raise.
+# Errors that a record may raise that somebody has edited.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 
 
@@ -140,7 +139,7 @@ class Report:
         self.source, self.runs, self.studies = source, runs, studies.items()
         self.views = [TableView(result) for result in track(source)]
         self.every = claims_of(self.views)
-        # Of a claim the verdict by the most seeds at the largest scale counts.
+        # The verdict of a claim by the most seeds at the largest scale counts.
         ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
         order = self.every.assign(rank=ranks.fillna(-1)).sort_values(
             ["rank", "seeds"], kind="stable"
@@ -277,7 +276,7 @@ class Report:
         body = "".join(part if place % 2 else reader.render(part) for place, part in parts)
         body = body.replace("<table>", '<div class="scroll"><table>')
         body = body.replace("</table>", "</table></div>")
-        for name, content in self.images().items():
+        for name, content in self.images.items():
             address = f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
             body = body.replace(f'src="{name}"', f'src="{address}"')
         script = (TEMPLATES / "sort.js").read_text()
@@ -286,12 +285,9 @@ class Report:
         page = shell.get_template("page.html.j2")
         return page.render(body=body, script=script, hash=f"sha256-{digest}")
 
+    @cached_property  # a second drawing has another layout
     def images(self) -> dict[str, bytes]:
         """The figures of the pages that were made, as SVG by the names of their files."""
-        return self._images
-
-    @cached_property
-    def _images(self) -> dict[str, bytes]:  # a second drawing has another layout
         import tempfile
 
         from analysis.figures.plots import save
@@ -308,9 +304,7 @@ class Report:
         Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
         the papers and ``count runs`` that of runs, ``cell TABLE COLUMN ROW`` a mean over seeds with
         its standard deviation, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
-
-        Raises:
-            InputError: a mark that names nothing.
+        InputError: a mark that names nothing.
         """
         return MARKED.sub(lambda mark: f"{mark[1]}{self._block(mark[2])}{mark[3]}", text)
 
@@ -351,16 +345,9 @@ def _networks(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
             sizes.append((each["name"], f"`model={model}`", f"{million_parameters(words):.2f}"))
         weights += [(each["name"], file, f"<{address}>") for file, address in each["weights"]]
         tests.append((each["name"], ", ".join(f"`{test}`" for test in each["tests"])))
-    headers = (
-        ("network", "configuration", "million parameters"),
-        ("network", "file", "published at"),
-    )
     grids = {
-        "networks": TextTable("", headers[0], tuple(sizes)),
-        "weights": TextTable("", headers[1], tuple(weights)),
+        "networks": TextTable("", ("network", "configuration", "million parameters"), tuple(sizes)),
+        "weights": TextTable("", ("network", "file", "published at"), tuple(weights)),
         "tests": TextTable("", ("network", "test"), tuple(tests)),
     }
     return {name: markdown(grid) for name, grid in grids.items()}
-
-
-PAPERS = tuple(sorted(path.name for path in PUBLISHED.iterdir()))

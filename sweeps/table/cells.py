@@ -21,11 +21,11 @@ NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value f
 # Path, in the run folder, of the counts of the evaluation that every run makes itself.
 OWN_COUNTS = "counts_test.npz"
 
-NO_SEED = "-1"  # of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
+NO_SEED = "-1"  # seed of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 
 CellId = tuple[str, str]  # (label of the row, name of the column)
 Value = float | str  # a score, or the reason why there is none
-Reader = Callable[[RunResult, str], Counts]  # of the counts of a run, by their path in its folder
+Reader = Callable[[RunResult, str], Counts]  # reads the counts of a run by their path
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from pydantic import model_validator
 Expected = Literal["higher", "lower", "similar"]
 Combine = Literal["all", "most", "any", "mean"]
 
-OTHERS = "others"  # in Claim.against: every other row that has a score or a printed value
-PREVIOUS = "previous"  # In `Claim.against`: the row before in `Claim.rows`
+OTHERS = "others"  # word in `Claim.against`: every other row that has a score or a printed value
+PREVIOUS = "previous"  # word in `Claim.against`: the row before in `Claim.rows`
 
 Range = tuple[float, float]
+# Ranges of a difference whose size does not matter.
 HIGHER: Range = (0.0, math.inf)
-# Of a difference whose size does not matter.
 LOWER: Range = (-math.inf, 0.0)
 
 STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}

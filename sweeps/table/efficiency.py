@@ -13,7 +13,7 @@ from rgbt.config.compose import compose
 from sweeps.table.cells import NO_VALUE, CellId, TableCell
 from sweeps.table.request import TableRequest
 
-SCALE = "paper"  # of all networks
+SCALE = "paper"  # scale of all networks
 NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")  # overrides that begin so
 
 

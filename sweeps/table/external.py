@@ -36,7 +36,7 @@ from sweeps.table.table import Row, Table
 from sweeps.worker.processes import run_command
 
 FOLDER = "external"  # inside the folder of runs
-NODE_FILE = "of_the_table"  # of conf/dataset and conf/metric, written for the commands
+NODE_FILE = "of_the_table"  # file of conf/dataset and conf/metric, for the commands
 # Overrides of the user that reach a row with a network of its own; others are for trainings.
 MACHINE = ("data.", "trainer.accelerator=", "trainer.precision=", "trainer.threads=")
 
@@ -140,7 +140,7 @@ class ExternalRun:
         return cls(given, row, config, arguments, folder)
 
     def outcome(self, table: Table, trust: str) -> Outcome:
-        """Its run, with all counts that columns of `table` need; those that are missing are made.
+        """The outcome with all counts that columns of `table` need; missing ones are made.
 
         "failed" if there are none; one that fails beside others is the reason of its columns alone.
         """

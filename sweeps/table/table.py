@@ -1,17 +1,20 @@
-"""The parts of a table file: columns, rows, the printed values; and what they must fulfil."""
+"""A table file: where it is; its columns, rows and printed values; and what they must fulfil."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
 from pydantic import BeforeValidator, model_validator
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import available, chosen_scale
+from rgbt.config.values import check_value
+from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
 from rgbt.metrics.named import PAIR_SCORES, parse
 from rgbt.metrics.pairs import Protocol
@@ -19,12 +22,17 @@ from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
+PUBLISHED = Path(__file__).resolve().parents[1] / "tables"  # tables of the papers
+STUDIES = Path(__file__).resolve().parents[1] / "studies"  # our tables, which no paper has printed
+OWN = Path("tables")  # tables of the user, in the current folder
+
 Form = Literal["paper", "released"]  # what a row is run as
 
 # Ending of the label of a row in its released form, beside the row of the paper's form.
 RELEASED = ", released"
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
+# Metrics of the most important columns of a table.
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,13 +306,10 @@ class Table(Strict):
         return [each for each in self.columns if each.metric in shown]
 
     def both_forms(self) -> Table:
-        """With a row below each one that the release makes in another way, and claims about both.
+        """The table with a second row for each one that the release makes in another way.
 
-        The claims are that the released form scores higher; those of the paper are left out, as
-        they are about the rows of one form.
-
-        Raises:
-            InputError: no row has a released form of its own.
+        Its claims are that the released form scores higher; those of the paper are left out, as
+        they are about the rows of one form. InputError: no row has a released form of its own.
         """
         rows: list[Row] = []
         claims: list[Claim] = []
@@ -337,3 +342,47 @@ class Table(Strict):
                 "use form=paper."
             )
         return replace(self, rows=tuple(rows), claims=tuple(claims))
+
+
+def table_names(folder: Path = OWN) -> list[str]:
+    """Names for `load_table`: the papers' tables, then those in `folder`."""
+    return [
+        path.relative_to(root).with_suffix("").as_posix()
+        for root in (PUBLISHED, folder)
+        for path in sorted(root.rglob("*.yaml"))
+    ]
+
+
+def study_names() -> list[str]:
+    """Names for `load_table` of our own studies."""
+    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
+
+
+def table_path(name: str, folder: Path = OWN) -> Path:
+    """The file of a table; InputError: no such table, or two of that name.
+
+    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one in
+    the `folder` of the user's tables; or a path that ends in .yaml.
+    """
+    if name.endswith((".yaml", ".yml")):
+        return Path(name).expanduser()
+    places = [root / f"{name}.yaml" for root in (PUBLISHED, STUDIES, folder)]
+    paths = [path for path in places if path.is_file()]
+    if len(paths) > 1:
+        raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
+    if not paths:
+        known = [*table_names(folder), *study_names()]
+        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
+    return paths[0]
+
+
+def is_own(name: str) -> bool:
+    """Whether a table is one of the user, which no test of this project has checked."""
+    return not table_path(name).resolve().is_relative_to(PUBLISHED.parent)
+
+
+def load_table(name: str, folder: Path = OWN) -> Table:
+    """Read and check a table (see `table_path`); InputError names its file and the wrong key."""
+    path = table_path(name, folder)
+    table: Table = check_value(str(path), read_yaml(path), Table)
+    return table

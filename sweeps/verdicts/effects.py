@@ -77,7 +77,7 @@ def effects_of(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> Effects:
             sides = (_evidence(judge, each, seeds) for each in (own, other))
             differences = [combine((1.0, -1.0), pair) for pair in zip(*sides, strict=True)]
             found[method.against or ""] = differences
-        except InputError:  # of a method that is named itself
+        except InputError:  # its missing runs are named with that method
             pass
         for against, cells in found.items():
             place = {"part": part, "outcome": outcome, "method": method.name, "against": against}

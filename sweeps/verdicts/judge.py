@@ -31,7 +31,6 @@ from sweeps.table.cells import (
     counts_path,
     is_counted,
     metric_of,
-    published,
     world_evaluations,
 )
 from sweeps.table.claim import HIGHER, LOWER, Claim
@@ -39,7 +38,7 @@ from sweeps.table.design import sign_of
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.table.table import Column, Row, Table
 
-# Of the images: enough for a standard error, which is known to 2 % then.
+# Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000
 
 # (label of the row, seed); the seed of a row that was not trained here is `FIXED`.
@@ -92,15 +91,15 @@ class StoredRuns:
                 each.append(settings)
                 lists.setdefault(run_lists, {})[label] = None
                 machines.setdefault(seed, set()).add(machine)
-        images, scales, starts = (set(values) for values in zip(*each, strict=True))
+        images, scales, starts = (sorted(set(values)) for values in zip(*each, strict=True))
         mixed = [str(seed) for seed, found in machines.items() if len(found - {""}) > 1]
-        shown = "; ".join(f"{', '.join(labels)} {name}" for name, labels in lists.items() if name)
+        rows_of = "; ".join(f"{', '.join(labels)} {name}" for name, labels in lists.items() if name)
         warnings = (
-            f"Different lists: {shown}." * (len(lists.keys() - {""}) > 1),
+            f"Different lists: {rows_of}." * (len(lists.keys() - {""}) > 1),
             f"Seeds {', '.join(mixed)} mix machines, which train differently." * bool(mixed),
         )
-        kind, scale = (" and ".join(sorted(values)) for values in (images, scales))
-        return Basis(kind, scale, len(starts), tuple(filter(None, warnings)))
+        shown = tuple(filter(None, warnings))
+        return Basis(" and ".join(images), " and ".join(scales), len(starts), shown)
 
 
 def _settings_of(run: RunResult) -> tuple[str, str, str, str, str]:
@@ -141,17 +140,18 @@ class Contrast(NamedTuple):
         """Labels of its rows."""
         return {cell.row for cell in self.cells}
 
-    def printed(self, table: Table) -> float | None:
-        """The contrast of the printed values; None where one of them is not printed."""
-        rows = {row.label: row for row in table.rows}
-        columns = {column.name: column for column in table.columns}
-        total = 0.0
-        for weight, row, column, _ in self.cells:
-            value = published(rows[row], columns[column]) if row in rows else None
-            if value is None:
-                return None
-            total += weight * value
-        return total
+    def of_values(self, values: Mapping[CellId, float]) -> float | None:
+        """The contrast of exact values of its cells; None where one is missing."""
+        ids = [(cell.row, cell.column) for cell in self.cells]
+        if not {*ids} <= values.keys():
+            return None
+        return sum(cell.weight * values[each] for cell, each in zip(self.cells, ids, strict=True))
+
+
+def printed_values(table: Table) -> dict[CellId, float]:
+    """The printed value of every row and column that has one."""
+    values = ((row.label, *each) for row in table.rows for each in row.values.items())
+    return {(label, name): float(value) for label, name, value in values if value is not None}
 
 
 def contrasts_of(claim: Claim, table: Table) -> list[Contrast]:
@@ -175,11 +175,7 @@ def difference(row: str, other: str | None, column: str, minus: str | None = Non
 
 
 def base_scores(table: Table, row: Row, name: str) -> Iterator[tuple[float, Column]]:
-    """(weight, column) of the scores of counts that a column of a row is computed from.
-
-    Raises:
-        KeyError: the row has no such column.
-    """
+    """The scores that a column is computed from, with weights; KeyError: the row has no such."""
     columns = {column.name: column for column in table.columns_of(row)}
     column = columns[name]
     if not column.sources:
@@ -241,12 +237,7 @@ class JudgedClaim:
 class TableJudge:
     """Judges claims of one table; keeps counts and resampled scores between calls.
 
-    Attributes:
-        name: of the table.
-        rule: when a claim is decided.
-        resamples: of the images.
-        sizes: exact values of cells that are counted without a run.
-        stored: the runs that were read.
+    `rule` says when a claim is decided; `sizes` are cells that are counted without a run.
     """
 
     name: str
@@ -258,9 +249,12 @@ class TableJudge:
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
+        self._printed = printed_values(self.table)
+        sizes = {each: cell.mean for each, cell in self.sizes.items()}
+        self._exact = {each: size for each, size in sizes.items() if not math.isnan(size)}
         settings = Resampling(resamples=self.resamples, absent=self.table.absent)
         self.images = Resampler(settings)
-        # Of a design: generated scenes are independent, and those of a world have other labels.
+        # Worlds of a design: generated scenes are independent, and each world has its own labels.
         self.worlds = Resampler(replace(settings, blocks="none"), "names")
 
     def claims(self, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
@@ -270,7 +264,7 @@ class TableJudge:
     def judge(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> JudgedClaim:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
         contrasts = contrasts_of(claim, self.table) or self._effects(claim, runs)
-        printed = [each.printed(self.table) for each in contrasts]
+        printed = [each.of_values(self._printed) for each in contrasts]
         rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
         judged = partial(
@@ -280,7 +274,7 @@ class TableJudge:
             as_printed=as_claimed(claim, printed),
             missing=tuple(label for label, each in finished.items() if not each),
         )
-        exact = [self._exact(each) for each in contrasts]
+        exact = [each.of_values(self._exact) for each in contrasts]
         if (is_so := as_claimed(claim, exact)) is not None:
             verdict = _exact_verdict(exact[0] or 0.0, is_so=is_so)
             label = contrasts[0].label
@@ -340,20 +334,10 @@ class TableJudge:
             found.append(Contrast(label, cells))
         return found
 
-    def _exact(self, contrast: Contrast) -> float | None:
-        """The value of a contrast of exact cells; None where one of them is not."""
-        sizes = [self.sizes.get((cell.row, cell.column)) for cell in contrast.cells]
-        pairs = zip(contrast.cells, sizes, strict=True)
-        total = math.fsum(
-            math.nan if size is None else cell.weight * size.mean for cell, size in pairs
-        )
-        return None if math.isnan(total) else total
-
     def terms(self, cells: Sequence[Cell], runs: Mapping[CellRunId, Outcome]) -> list[Term]:
         """The scores of counts, by seed, that a weighted sum of cells is made of.
 
-        Raises:
-            InputError: a row without a finished run or the score, or rows of the same runs.
+        InputError: a row has no finished run or not the score, or the rows are the same runs.
         """
         found = [term for cell in cells for term in self._terms(cell, runs)]
         sums: dict[tuple[str, ...], float] = {}

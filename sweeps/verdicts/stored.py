@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import get_args
 
 from rgbt.checks import InputError
@@ -14,9 +13,8 @@ from rgbt.runs.result import RunResult
 from sweeps.point import Outcome, Point
 from sweeps.table.cells import ScoredTable, score, size_marks
 from sweeps.table.efficiency import network_sizes
-from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import DEFAULT_SCALE, TAG, TableRequest
-from sweeps.table.table import RELEASED, Form, Table
+from sweeps.table.table import RELEASED, Form, Table, load_table, study_names, table_names
 from sweeps.verdicts.effects import Effects, effects_of
 from sweeps.verdicts.judge import (
     RESAMPLES,
@@ -56,9 +54,7 @@ def stored_runs(
     """The finished runs of every row; rows that cannot be composed have none.
 
     A row is composed if a finished run is of its experiment, or if its settings are `checked`.
-
-    Raises:
-        InputError: no row can be composed.
+    InputError: no row can be composed.
     """
     runs: dict[CellRunId, Outcome] = {}
     errors, rows = [], request.trained_rows
@@ -77,7 +73,7 @@ def stored_runs(
             if run := finished.by_seed[seed].get(key):
                 runs[row.label, seed] = Outcome(Point(row.label, ()), "finished", results=(run,))
     if errors and len(errors) == len(rows):
-        raise errors[0]  # of the command, and not of a row
+        raise errors[0]  # the command is wrong, and not a row
     return runs
 
 
@@ -120,12 +116,12 @@ class Variant:
     extra: tuple[str, ...] = ()
 
 
-def known_tables(own: Path, remarks: list[str]) -> dict[str, Table]:
+def known_tables(remarks: list[str]) -> dict[str, Table]:
     """All tables of the papers, of ours, and of the user; one that is not read is a remark."""
     tables = {}
-    for name in dict.fromkeys([*table_names(own), *study_names()]):
+    for name in dict.fromkeys([*table_names(), *study_names()]):
         try:
-            tables[name] = load_table(name, own)
+            tables[name] = load_table(name)
         except InputError as error:
             remarks.append(f"Table '{name}' is left out: {error}")
     return tables
@@ -137,8 +133,6 @@ class TableResults:
 
     Attributes:
         finished: the runs; a run belongs to every table with a row of its key.
-        planner: composes the rows.
-        resamples: of the images.
         counted: whether the sizes of networks are counted, which needs torch.
         remarks: what cannot be read or composed, one sentence each.
     """
@@ -166,7 +160,7 @@ class TableResults:
             words = [each for each in run.description.overrides if not each.startswith("seed=")]
             scales = [each.removeprefix("scale=") for each in words if each.startswith("scale=")]
             scale = scales[-1] if scales else DEFAULT_SCALE
-            # Tables share runs: of one of them the row says what was typed beside its words.
+            # Tables share runs: the rows of one of them tell what else was typed.
             fitting = [
                 each for pair in tagged.items() for each in self._fitting(*pair, words, scale)
             ]
@@ -190,8 +184,7 @@ class TableResults:
     def of(self, name: str, variant: Variant | None = None) -> TableResult:
         """The result of one table; without a variant it has no runs.
 
-        Raises:
-            InputError: no row can be composed.
+        InputError: no row can be composed.
         """
         how = variant or Variant()
         table = self.tables[name]
@@ -205,7 +198,7 @@ class TableResults:
         *,
         checked: bool = False,
     ) -> TableResult:
-        """The result of a request; None: of all finished `runs`, see `stored_runs`."""
+        """The result of a request by `runs`; None: by all finished ones, see `stored_runs`."""
         if runs is None:
             runs = stored_runs(request, self.finished, self.planner, checked=checked)
         sizes = network_sizes(request) if self.counted else {}

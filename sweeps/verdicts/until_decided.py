@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sweeps.point import Outcome, Point
-from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, contrasts_of
 
@@ -54,7 +53,9 @@ class SeedsUntilDecided:
         self._seen = finished
         wanted: dict[CellRunId, None] = {}
         for judged in self.judge.claims({**runs, **self.external}):
-            labels = self._trained(judged.claim)
+            contrasts = contrasts_of(judged.claim, self.request.table)
+            named = {label for each in contrasts for label in each.rows}
+            labels = [row.label for row in self.request.trained_rows if row.label in named]
             own = {each: run for each, run in runs.items() if each[0] in labels}
             unfinished = {seed for (_, seed), run in own.items() if run.state != "finished"}
             is_failed = any(run.state == "failed" for run in own.values())
@@ -65,12 +66,6 @@ class SeedsUntilDecided:
             wanted |= dict.fromkeys(next(filter(None, lacking), []))
         have = {outcome.point.overrides for outcome in outcomes}
         return [each for each in self.request.points(list(wanted)) if each.overrides not in have]
-
-    def _trained(self, claim: Claim) -> list[str]:
-        """Labels of the trained rows of a claim."""
-        contrasts = contrasts_of(claim, self.request.table)
-        named = {label for each in contrasts for label in each.rows}
-        return [row.label for row in self.request.trained_rows if row.label in named]
 
 
 def _is_open(judged: JudgedClaim) -> bool:

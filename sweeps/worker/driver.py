@@ -134,7 +134,7 @@ class Driver:
         start = partial(self._start, slot, claimed.plan.point.tags)
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
         trial = RunningTrial(claimed, self.runs, start, limit_s, self.settings.trust)
-        self.view.began(trial)
+        self.view.say("started", trial.plan.point.label)
         self.running[slot] = trial
         # A point that was finished elsewhere needs no process: its slot is free at once.
         if self._advance(trial):

@@ -36,7 +36,7 @@ class PointList:
         title: shown above the progress.
         kind: "grid" or "list".
         runs: finished runs; the points' overrides name the same folder.
-        base: overrides that all have.
+        planner: plans them, with the overrides that all have.
         more: further points, from the outcomes until now; requested when no point is waiting.
         rank: which waiting point is the next: the one of the highest rank, and `more` is requested
             before each; None: they are run in their order.
@@ -47,7 +47,7 @@ class PointList:
     kind: str
     points: tuple[Point, ...]
     runs: RunStore
-    base: tuple[str, ...] = ()
+    planner: Planner
     more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
     rank: Callable[[Point], float] | None = None
 
@@ -60,16 +60,8 @@ class ListSource:
 
     store: TrialStore
 
-    def __init__(
-        self,
-        points: PointList,
-        settings: SweepSettings,
-        planner: Planner | None = None,
-        *,
-        strict: bool = False,
-    ) -> None:
+    def __init__(self, points: PointList, settings: SweepSettings, *, strict: bool = False) -> None:
         self._list, self._settings, self._strict = points, settings, strict
-        self._planner = planner or Planner(points.base)
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}
         self.errors: dict[int, str] = {}
@@ -106,7 +98,7 @@ class ListSource:
 
     def _plan(self, index: int, point: Point) -> None:
         try:
-            plan = self._planner.plan(point)
+            plan = self._list.planner.plan(point)
             for run in plan.runs if point.evaluations else ():
                 check_targets(run.plain, parse_trust(self._settings.trust), point.label)
         except InputError as error:
@@ -218,21 +210,15 @@ def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
     return bool(results) and all(each.is_stored(result) for result in results for each in wanted)
 
 
-def preview_points(
-    points: PointList, settings: SweepSettings, planner: Planner | None = None
-) -> list[Outcome]:
+def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     """The present state of the points; nothing is run and nothing written."""
-    source = ListSource(points, settings, planner)
+    source = ListSource(points, settings)
     study = known_studies(settings.storage, points.runs.runs_dir).get(points.study)
     return source.outcomes(study, preview=True)
 
 
 def run_points(
-    points: PointList,
-    settings: SweepSettings,
-    planner: Planner | None = None,
-    *,
-    strict: bool = False,
+    points: PointList, settings: SweepSettings, *, strict: bool = False
 ) -> list[Outcome]:
     """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
 
@@ -240,7 +226,7 @@ def run_points(
         InputError: the storage or the executor cannot be used, all points have a wrong
             configuration, or with `strict` one of them.
     """
-    source = ListSource(points, settings, planner, strict=strict)
+    source = ListSource(points, settings, strict=strict)
     storage = stores.open_storage(settings.storage, points.runs.runs_dir)
     study = stores.open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
     source.store = TrialStore(study, storage)

@@ -12,7 +12,7 @@ from rgbt.config.compose import compose
 from rgbt.runs.provenance import code, packages
 from rgbt.runs.source_code import loaded_modules, user_code
 
-# Not imported before: what runs execute as programs, a few lines each, or do not use.
+# Modules that are not imported: runs execute them as programs, or do not use them.
 PROGRAMS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency", "rgbt.api")
 
 LIBRARIES = (
@@ -33,6 +33,6 @@ for _module in pkgutil.walk_packages(rgbt.__path__, "rgbt."):
 code()
 packages()
 user_code(f"{name}.any" for name in loaded_modules())
-compose(["+experiment=grbm"])  # for what Hydra keeps: its plugins and its grammar
+compose(["+experiment=grbm"])  # Hydra keeps its plugins and its grammar
 gc.freeze()  # nor need the collector of a run visit it
 gc.enable()

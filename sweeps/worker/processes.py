@@ -39,7 +39,8 @@ class LocalExecutor:
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> LocalJob:
         """Start ``python -m <command>`` with more variables; its output is appended to `log`."""
         log.parent.mkdir(parents=True, exist_ok=True)
-        # Without effect once the server runs. The user's own modules that planned points have read.
+        # The user's own modules that planned points have read are imported too. This has no effect
+        # once the server runs.
         self._context.set_forkserver_preload([CWD_LAST, *counted_modules(), PRELOADED])
         arguments = (tuple(command), dict(environment), str(log), str(Path.cwd()))
         process = self._context.Process(target=_run_module, args=arguments)

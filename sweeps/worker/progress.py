@@ -61,10 +61,6 @@ class ProgressView:
     def __exit__(self, *error: object) -> None:
         self._bars.stop()
 
-    def began(self, trial: RunningTrial) -> None:
-        """Show that a trial begins."""
-        self.say("started", trial.plan.point.label)
-
     def ended(self, trial: RunningTrial, how: str, reason: str) -> None:
         """Show that a trial ended: "finished", "failed" or "pruned", and why."""
         text = f"{trial.plan.point.label}  {trial.seconds:.0f} s{_score(trial)}"

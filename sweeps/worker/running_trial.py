@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -73,7 +72,7 @@ class RunningTrial:
         self._began = time.monotonic()
         self._job: LocalJob | None = None
         self._folder = Path()
-        self._size, self._step, self._validated = 0, 0, 0  # of the metrics of the present run
+        self._size, self._step, self._validated = 0, 0, 0  # metrics of the present run
         self._results: tuple[RunResult, ...] = ()
         self._end: Exception | None = None
         self._unreported: list[MetricLine] = []
@@ -131,13 +130,11 @@ class RunningTrial:
     def _execute(self) -> Iterator[None]:
         evaluations = self.plan.point.evaluations
         for run in self.plan.runs:
-            find = partial(
-                self.runs.find, run.key, self.plan.fingerprints[run.key], evaluations=evaluations
-            )
-            result = find()
+            wanted = (run.key, self.plan.fingerprints[run.key], evaluations)
+            result = self.runs.find(*wanted)
             if result is None:
                 yield from self._train(run)
-                result = find()
+                result = self.runs.find(*wanted)
             if result is None:
                 raise TrialError(
                     f"the run finished with another key than {run.key}: its configuration, its "

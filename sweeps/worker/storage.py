@@ -53,7 +53,7 @@ def open_storage(storage: str | None, runs_dir: Path) -> RDBStorage:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    warnings.filterwarnings("ignore", message="Heartbeat of storage")  # for optimize(), it says
+    warnings.filterwarnings("ignore", message="Heartbeat of storage")  # it is about optimize()
     url = storage_url(storage, runs_dir)
     if not storage:
         runs_dir.mkdir(parents=True, exist_ok=True)

@@ -27,7 +27,7 @@ def test_pages_figures_and_marked_numbers_follow_from_the_archive(
     for name in marked[1].split(","):
         made[ROOT / name] = report.filled((ROOT / name).read_text())
     differing = [str(path) for path, text in made.items() if path.read_text() != text]
-    images = {RESULTS / name: content for name, content in report.images().items()}
+    images = {RESULTS / name: content for name, content in report.images.items()}
     assert set(RESULTS.glob("*.svg")) == set(images)
     differing += [str(path) for path, content in images.items() if path.read_bytes() != content]
     assert differing == [], "make results"

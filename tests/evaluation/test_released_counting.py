@@ -20,7 +20,7 @@ from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
 from rgbt.types import Batch, Output
-from sweeps.table.load_table import load_table
+from sweeps.table.table import load_table
 from tests.composed import specified
 from tests.evaluation.test_details import Decoder, session_of
 

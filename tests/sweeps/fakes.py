@@ -266,9 +266,6 @@ class FakeView:
         self.said: list[tuple[str, str]] = []
         self.update = look
 
-    def began(self, work: RunningTrial) -> None:
-        del work
-
     def ended(self, work: RunningTrial, how: str, reason: str) -> None:
         self.ends.append((work.plan.point.label, how, reason))
 
@@ -349,8 +346,8 @@ def list_desk(
 ) -> Desk:
     """A driver of a list of points, which are planned."""
     wanted, runs = settings(**changes), RunStore(runs_dir, NoTracking())
-    wished = PointList("study", "s", "list", tuple(given), runs, (), more)
-    source = ListSource(wished, wanted, FakePlanner())  # type: ignore[arg-type]
+    wished = PointList("study", "s", "list", tuple(given), runs, FakePlanner(), more)  # type: ignore[arg-type]
+    source = ListSource(wished, wanted)
     source.store = store_on(memory() if storage is None else storage, wanted)
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
     driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]

@@ -9,11 +9,10 @@ import pytest
 
 from rgbt.config.options import types_of
 from sweeps.point import Outcome, Point
-from sweeps.reproduce import TABLE_OPTIONS, Options, entry
+from sweeps.reproduce import Options, entry, settings_of
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
-from sweeps.worker.planner import Planner
 from sweeps.worker.point_list import PointList
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
@@ -50,7 +49,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     def drive(*states: str) -> Asked:
         asked: Asked = []
 
-        def work(wanted: PointList, settings: SweepSettings, _: Planner) -> Sequence[Outcome]:
+        def work(wanted: PointList, settings: SweepSettings) -> Sequence[Outcome]:
             asked.append((wanted, settings))
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
             return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
@@ -77,7 +76,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     (wanted, settings), *others = asked
     assert not others
     assert wanted.study == "table/my/small"
-    assert wanted.base == ("runs_dir=runs", "tracking=none")
+    assert wanted.planner.base == ("runs_dir=runs", "tracking=none")
     assert [point.overrides for point in wanted.points][:2] == [
         ("+experiment=grbm", "masker.sigma_div=1", "dataset.root=/x", "seed=0"),
         ("+experiment=grbm", "masker.sigma_div=2", "dataset.root=/x", "seed=0"),
@@ -137,5 +136,16 @@ def test_mistakes_are_reported_in_one_sentence(
     assert_one_sentence(err, key)
 
 
-def test_reproduce_options_are_sweep_settings() -> None:
-    assert set(types_of(Options)) - set(TABLE_OPTIONS) < set(SweepSettings.__dataclass_fields__)
+def test_options_of_execution_are_sweep_settings() -> None:
+    changes: dict[str, Any] = {
+        "dry_run": True,
+        "workers": 2,
+        "gpus": (0, 1),
+        "retry": "failed",
+        "wait": False,
+        "storage": "postgresql://user@host/name",
+        "timeout_minutes": 3.0,
+        "trust": "my_lab",
+    }
+    assert set(types_of(Options)) & set(SweepSettings.__dataclass_fields__) == set(changes)
+    assert vars(settings_of(Options("my/small", **changes))).items() >= changes.items()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -110,12 +109,13 @@ def test_tables_of_list_keep_point_order_and_last_trials() -> None:
     assert failed.rows == (("by signal | 9", "4", "x", "r1 r2"),)
 
 
-def test_trials_csv_has_all_trials_with_full_numbers() -> None:
+def test_trials_csv_has_all_trials_with_full_numbers(tmp_path: Path) -> None:
     made = new_study("val/mIoU")
     add(made, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
     reported = {10: 1.0, 20: 2.0}
     add(made, state="PRUNED", params={"a.x": 0.2}, reported=reported, reason="at 20, low")
-    first, second = csv.DictReader(io.StringIO(study.trials_csv(StudyData.read(made))))
+    study.publish_study(made, tmp_path, "")
+    first, second = csv.DictReader((tmp_path / "trials.csv").open())
     assert float(first["val/mIoU"]) == 100 / 3
     assert list(first.values())[5:] == ["31.0", "2.5", "", "r", ""]
     assert list(second.values())[3:] == ["0.2", "", "", "", "20", "", "at 20, low"]

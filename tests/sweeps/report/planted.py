@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
-from sweeps.table.load_table import load_table
 from sweeps.table.request import TAG, TableRequest
+from sweeps.table.table import load_table
 from sweeps.table_plan import make_request
 from sweeps.worker.planner import Planner
 from tests.sweeps.verdicts.accuracies import accuracy

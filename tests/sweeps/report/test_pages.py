@@ -22,9 +22,11 @@ from rgbt.checks import InputError
 from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.result import RunResult
 from sweeps.report.__main__ import entry, report_of
-from sweeps.report.pages import PAPERS, Report
+from sweeps.report.pages import Report
 from tests.commands import Call
 from tests.sweeps.report.planted import plant
+
+PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
 OWN = """
 paper: my
@@ -254,7 +256,7 @@ def test_archive_gives_same_pages_and_run_changes_them(
     own = made(Path("none"), archive)
     pages = {name: own.page(name) for name in names}
     assert pages == {name: report.page(name) for name in names}
-    assert own.images() == report.images(), "equal runs give equal figures"
+    assert own.images == report.images, "equal runs give equal figures"
     gone = next(f for f in folders if "rgbt.table/my/planted" in RunResult(f).tags)
     (archive / f"{gone.name}.zip").unlink()
     less = made(Path("none"), archive)
@@ -296,7 +298,7 @@ def test_empty_archive_says_so_with_the_command(tmp_path: Path) -> None:
     assert "No run yet." in found.page("index")
     assert "rgbt reproduce table=missing_image scale=bench seeds=4" in found.page("index")
     assert "158 not run" in found.page("claims") or "| temporal |" in found.page("claims")
-    assert found.images() == {}
+    assert found.images == {}
     for paper in PAPERS:
         assert "<summary>" in found.page(paper)
 

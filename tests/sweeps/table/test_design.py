@@ -12,8 +12,8 @@ import yaml
 from rgbt.checks import InputError
 from rgbt.config.values import check_value
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part, cell_name
-from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
+from sweeps.table.table import load_table
 
 MEANS = {"low_means": "little", "high_means": "much"}
 FACTORS: list[dict[str, Any]] = [

@@ -16,9 +16,8 @@ from rgbt.config.component import build
 from rgbt.config.compose import flatten
 from rgbt.runs.run_spec import RunSpec
 from sweeps.table.efficiency import million_parameters
-from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import TableRequest
-from sweeps.table.table import Form, Row, Table
+from sweeps.table.table import Form, Row, Table, load_table, study_names, table_names
 from sweeps.table_plan import check_equal_runs
 from sweeps.worker.planner import Planner, specify_run
 from tests.composed import specified

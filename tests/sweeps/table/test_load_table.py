@@ -10,8 +10,7 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from sweeps.table.load_table import load_table
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.table import Column, Row, Table, load_table
 
 SMALL: dict[str, Any] = {
     "paper": "my",

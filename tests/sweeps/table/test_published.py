@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
-from sweeps.table.load_table import load_table, table_names
-from sweeps.table.table import Row
-from sweeps.verdicts.judge import as_claimed, contrasts_of
+from sweeps.table.table import Row, load_table, table_names
+from sweeps.verdicts.judge import as_claimed, contrasts_of, printed_values
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"
@@ -108,7 +107,8 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
     found = {}
     for name, table in OURS.items():
         for claim in table.claims:
-            printed = [each.printed(table) for each in contrasts_of(claim, table)]
+            values = printed_values(table)
+            printed = [each.of_values(values) for each in contrasts_of(claim, table)]
             found[f"{name} {claim.name}"] = as_claimed(claim, printed)
             sizes = [round(abs(value), 1) for value in printed if value is not None]
             for size in re.findall(r"(?:has|gains?) (\d+\.\d)", claim.says):

@@ -10,9 +10,8 @@ from rgbt.config.compose import available, compose
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
-from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest, seeds_of
-from sweeps.table.table import Column, Row
+from sweeps.table.table import Column, Row, load_table
 from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
 from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table

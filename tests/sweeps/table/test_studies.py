@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
+from sweeps.table.table import load_table
 from sweeps.table_plan import make_request
 from sweeps.worker.planner import Planner
 

@@ -4,7 +4,7 @@ import pytest
 
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row
-from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, difference
+from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, difference, printed_values
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -51,7 +51,7 @@ def test_contrasts_of_a_claim(others: dict[str, object], labels: list[str]) -> N
     ],
 )
 def test_printed_value_of_a_contrast(contrast: Contrast, value: float | None) -> None:
-    assert contrast.printed(TABLE) == value
+    assert contrast.of_values(printed_values(TABLE)) == value
 
 
 def test_derived_columns_are_sums_of_scores() -> None:

@@ -20,7 +20,6 @@ from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome, Point
 from sweeps.worker import driver as drivers
-from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.point_list import (
     ListSource,
@@ -56,13 +55,13 @@ def executor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: None) -> Fa
     del quick
     made = FakeExecutor(tmp_path)
     monkeypatch.setattr(drivers, "LocalExecutor", lambda workers: made)
-    monkeypatch.setattr(point_list, "Planner", lambda base: FakePlanner())
     return made
 
 
 def a_list(runs: Path, *words: str, more: Any = None) -> PointList:
+    planner: Any = FakePlanner()
     given = tuple(Point(word, (word,), tags={"t": "grid"}) for word in words)
-    return PointList("s", "s", "grid", given, RunStore(runs, NoTracking()), more=more)
+    return PointList("s", "s", "grid", given, RunStore(runs, NoTracking()), planner, more)
 
 
 def test_run_points_strict_with_wrong_point_starts_nothing(
@@ -98,10 +97,10 @@ def test_untrusted_class_is_refused_before_training(
 
     (tmp_path / "my_lab.py").write_text("class Loss: ...\n")
     given = (Point("a", ("x=1",)), Point("b", ("x=2",), evaluations=(ExtraEvaluation(),)))
-    wanted = replace(a_list(tmp_path), points=given)
+    wanted = replace(a_list(tmp_path), points=given, planner=OwnLoss())  # type: ignore[arg-type]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
-        source = ListSource(wanted, settings(trust=trust), OwnLoss())  # type: ignore[arg-type]
+        source = ListSource(wanted, settings(trust=trust))
     states = {each.point.label: each for each in source.outcomes(preview=True)}
     assert states["a"].state == "waiting", "nothing opens its run"
     assert ("my_lab.Loss" in states["b"].reason) == is_refused
@@ -113,7 +112,8 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
             return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
 
     rows = tuple(Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0"))
-    source = ListSource(replace(a_list(tmp_path), points=rows), settings(), SameRun())  # type: ignore[arg-type]
+    wanted = replace(a_list(tmp_path), points=rows, planner=SameRun())  # type: ignore[arg-type]
+    source = ListSource(wanted, settings())
     found = source.outcomes(preview=True)
     tags = {"table": "1 | 1.0", VARIED: "x"}
     assert [each.point.tags for each in found] == [tags, tags]

@@ -42,7 +42,7 @@ def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
     text = console(False)
     view = ProgressView("table", 1, lambda: (0, 3))
     with view:
-        view.began(TRIAL)
+        view.say("started", TRIAL.plan.point.label)
         view.update([TRIAL])
         view.ended(TRIAL, "finished", "")
         view.ended(TRIAL, "failed", "a bad day")
@@ -59,7 +59,7 @@ def test_progress_in_terminal_draws_bars_and_prints_failures(console: Make) -> N
     text = console(True)
     view = ProgressView("table", 2, lambda: (1, 4))
     with view:
-        view.began(TRIAL)
+        view.say("started", TRIAL.plan.point.label)
         view.ended(TRIAL, "finished", "")
         view.ended(TRIAL, "failed", "a bad day")
         view.update([TRIAL])
