@@ -43,7 +43,7 @@ def external_page() -> str:
         ),
         "Published figures are those of the README, or of the paper if the column names it. "
         "Figures of papers were not compared with the text. *Lists* are those that the published "
-        'weights were trained and selected on; "not checked" where nobody has read them.',
+        'weights were trained and selected on; "not checked" where the repository does not say.',
         "## How they are called",
         table(
             ["`model=external/`", "Constructor", "Feed", "Inputs", "Sizes", "Scores"],
