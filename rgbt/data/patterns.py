@@ -216,7 +216,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
                 "dataset.rgb in which they differ."
             )
         if not any(map(os.path.lexists, paths)) and pattern is thermal:
-            folder = paths[0].parent
+            folder = next(each for each in paths[0].parents if each.is_dir())
             raise InputError(
                 f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
                 f"{paths[0]}, but {folder.name} holds {what_is_in(folder)}."

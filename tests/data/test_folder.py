@@ -250,6 +250,7 @@ def test_files_of_one_name_and_folder_without_permission(
         ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has no {name}"),
         ({"rgb": "{split}/rgb/{name}.jpg"}, "matches no file in .*, which holds test, train, val"),
         ({"thermal": "{split}/ir/{name}.tif"}, "dataset.thermal: .* but ir holds 1_ir.tif, 2_ir"),
+        ({"thermal": "{split}/t/{name}.tif"}, "dataset.thermal: .* but test holds ir"),
         ({"thermal": "{scene}/ir/{name}.tif"}, "dataset.thermal: .* 'scene' is not a valid choice"),
         ({"label": "test/mask/{name}.png"}, "several frames would share .*test/mask/1.png"),
         ({"lists": {"train": "a.txt"}}, "got {split} in dataset.rgb and dataset.lists"),
