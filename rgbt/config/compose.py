@@ -110,13 +110,25 @@ def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, .
 
 
 @lru_cache(maxsize=256)
-def _by_hydra(words: tuple[str, ...], _own: str) -> bytes:
+def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
+    _check_names(own)
     with own_hydra():
         config = hydra.compose("config", list(words), return_hydra_config=True)
     is_search = config.hydra.mode == RunMode.MULTIRUN
     with open_dict(config):
         del config["hydra"]
     return pickle.dumps((config, is_search))
+
+
+def _check_names(own: str) -> None:
+    """InputError: a file of the user is never read, because rgbt has one of its name."""
+    for folder in filter(None, (each.removeprefix("file://") for each in own.split(","))):
+        if Path(folder).resolve() == conf_dir().resolve():
+            continue
+        for file in sorted(Path(folder).rglob("*.yaml")):
+            name = file.relative_to(folder)
+            if (conf_dir() / name).is_file():
+                raise InputError(f"{file}: rgbt has conf/{name}, and uses that; rename yours.")
 
 
 class _ParsedOnce(FileConfigSource):

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config import compose as composing_module
 from rgbt.config.command import composing
-from rgbt.config.compose import available, compose, own_hydra, searching
+from rgbt.config.compose import available, compose, conf_dir, own_hydra, searching
 
 OWN = "# @package _global_\ndefaults:\n  - sh_source\n  - _self_\nname: own_stage\n"
 
@@ -46,6 +46,18 @@ def test_available_lists_the_search_path_of_the_command(
     monkeypatch.setenv("RGBT_CONF", f"{own},{own / 'scale'}")
     assert "own_stage" in available("experiment")
     assert compose(["+experiment=own_stage"]).name == "own_stage"
+
+
+def test_a_file_that_would_never_be_read_is_refused(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (own / "loss").mkdir()
+    (own / "loss" / "focal.yaml").write_text("_target_: my_lab.loss.Focal\n")
+    monkeypatch.setenv("RGBT_CONF", str(own))
+    with pytest.raises(InputError, match="rgbt has conf/loss/focal.yaml, and uses that"):
+        compose(["loss=focal"])
+    monkeypatch.setenv("RGBT_CONF", str(conf_dir()))
+    assert compose(["seed=8"]).seed == 8
 
 
 VARIED = """\
