@@ -365,11 +365,14 @@ class TableJudge:
                 if path != counts_path(plain, self.table):
                     raise InputError(f"'{column.name}' is no score of the plain test images.")
                 path = world_evaluations(self.table, row)[cell.world].path
+            # Another table may have trained further seeds, without this evaluation.
+            counted = {s: run for s, run in finished.items() if (run.folder / path).is_file()}
+            runs_of = counted or finished
             yield Term(
                 weight=cell.weight * part,
                 metric=metric_of(column, row),
-                counts={seed: self.stored.counts(run, path) for seed, run in finished.items()},
-                keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
+                counts={seed: self.stored.counts(run, path) for seed, run in runs_of.items()},
+                keys={seed: f"{run.key}/{path}" for seed, run in runs_of.items()},
             )
 
     def marks(self, scored: ScoredTable, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:
