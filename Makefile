@@ -20,7 +20,7 @@ SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
 TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt sweeps analysis hydra_plugins
 
 # Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
-MARKED := README.md,docs/results/spatial-bias.md
+MARKED := README.md,docs/results/findings.md,docs/results/spatial-bias.md
 
 .PHONY: demo test test-all lint docs site results mutants bench
 
