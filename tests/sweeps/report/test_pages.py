@@ -303,6 +303,7 @@ def test_empty_archive_says_so_with_the_command(tmp_path: Path) -> None:
         assert "<summary>" in found.page(paper)
 
 
+@pytest.mark.slow
 def test_command_writes_pages_fills_marks_and_removes_old_figures(
     call: Call, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
