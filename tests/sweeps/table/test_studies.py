@@ -36,7 +36,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["night", pytest.param("thermal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", ["night", "thermal"])
 def test_self_training_is_compared_at_equal_steps_and_start(task: str) -> None:
     """All second stages of one head start from one run, the source alone among them."""
     name = f"self_training_{task}"
