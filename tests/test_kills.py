@@ -47,7 +47,6 @@ class Training:
 
     place: Path
     executor: LocalExecutor
-    num_workers: int = 0
 
     def __post_init__(self) -> None:
         self.log = self.place / "log"
@@ -57,7 +56,7 @@ class Training:
         words = (
             *(f"tracking.uri=sqlite:///{root / 'mlflow.db'}", f"dataset.root={root / 'mf'}"),
             *(f"tracking.experiment={self.place.name}", f"runs_dir={self.place}"),
-            f"data.num_workers={self.num_workers}",
+            "data.num_workers=0",
         )
         command = ("tests.dying", instant, "rgbt.run", *SETTINGS, *words)
         return self.executor.start(command, {"OMP_NUM_THREADS": "1"}, self.log)
@@ -143,7 +142,7 @@ def check(bench: Bench, place: Path) -> None:
 
 
 def test_killed_at_random_instants(bench: Bench) -> None:
-    """Six kills; by the process or its whole group, with workers or without."""
+    """Six kills; by the process or its whole group."""
     draw = random.Random(0)
     training = Training(bench.root / "random", bench.executor)
     inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])

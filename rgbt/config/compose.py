@@ -120,6 +120,7 @@ def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
     return pickle.dumps((config, is_search))
 
 
+@cache
 def _check_names(own: str) -> None:
     """InputError: a file of the user is never read, because rgbt has one of its name."""
     for folder in filter(None, (each.removeprefix("file://") for each in own.split(","))):

@@ -11,15 +11,8 @@ from rgbt.checks import InputError, one_line
 if TYPE_CHECKING:  # --help waits for neither
     import pydantic
 
-KINDS = (
-    "int",
-    "float",
-    "str",
-    "bool",
-    "dict",
-    "list",
-    "tuple",
-)  # members of a union, as pydantic names them
+# Members of a union, as pydantic names them.
+KINDS = ("int", "float", "str", "bool", "dict", "list", "tuple")
 
 
 def check_value(path: str, value: Any, annotation: Any) -> Any:
