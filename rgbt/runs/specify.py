@@ -12,7 +12,9 @@ that every seed has a start of its own.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple, cast, get_args
 
 from omegaconf import DictConfig, OmegaConf
@@ -24,6 +26,7 @@ from rgbt.config.compose import (
     available,
     compose,
     flatten,
+    own_folders,
     register_resolvers,
     resolved,
 )
@@ -78,27 +81,30 @@ def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
     return requested_run(config, overrides).check()
 
 
-def requested_run(
-    config: DictConfig, overrides: Sequence[str] = (), downstream: tuple[str, ...] = ()
-) -> RunSpec:
+def requested_run(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
     """The same without checking the settings, so that no class of a component is imported.
 
     Args:
         config: as composed by Hydra.
         overrides: as typed.
-        downstream: names of the experiments whose upstream run this is.
 
     Raises:
         InputError: an unknown key, or upstream runs that do not exist or make a cycle.
     """
+    return _requested(config, resolved(config), overrides, ())
+
+
+def _requested(
+    config: DictConfig, plain: dict[str, Any], overrides: Sequence[str], downstream: tuple[str, ...]
+) -> RunSpec:
+    """A run of a configuration with its `plain` values; `downstream`: experiments that need it."""
     upstream = tuple(_dependencies(config, overrides, (*downstream, config.name)))
-    return _spec_of(config, overrides, upstream)
+    return _spec_of(plain, overrides, upstream)
 
 
 def _spec_of(
-    config: DictConfig, overrides: Sequence[str], upstream: tuple[Dependency, ...]
+    plain: dict[str, Any], overrides: Sequence[str], upstream: tuple[Dependency, ...]
 ) -> RunSpec:
-    plain = resolved(config)
     for name in NODES:
         if not isinstance(plain.get(name), dict) or "_target_" not in plain[name]:
             raise InputError(f"'{name}' must be a mapping with `_target_`.")
@@ -122,7 +128,7 @@ def _dependencies(
             circle = " -> ".join((*downstream, experiment))
             raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
         typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key, reference)]
-        run = requested_run(upstream_config(config, key, reference), typed, downstream)
+        run = _requested(*upstream_config(config, key, reference), typed, downstream)
         if reference.is_common and OmegaConf.select(config, "seeds.start") == "run":
             run = run.with_seed(run.seed + config.seed)
         yield Dependency(key, run, reference.checkpoint, reference.is_common)
@@ -165,33 +171,47 @@ def parse_reference(key: str, value: str | None) -> Reference | None:
     return Reference(name, cast(CheckpointFile, checkpoint), is_common)
 
 
-def upstream_config(config: DictConfig, key: str, reference: Reference) -> DictConfig:
-    """The configuration of an upstream run: its experiment, with what both runs share.
+def upstream_config(
+    config: DictConfig, key: str, reference: Reference
+) -> tuple[DictConfig, dict[str, Any]]:
+    """The configuration and plain values of an upstream run: its experiment, with what both share.
 
     Shared are `SHARED`, the sizes of the scale and durations that were typed; for weights also the
     network. A common run shares `SHARED_BY_COMMON` instead of `SHARED`. Everything else is the
-    experiment's own.
+    experiment's own. Callers do not change it: runs that share the same values have the same one.
     """
-    scale = config.scale.name
-    upstream = compose([f"+experiment={reference.experiment}"])
-    if upstream.scale.name != scale:
-        upstream = compose([f"+experiment={reference.experiment}", f"scale={scale}"])
-    own = RUN_SETTINGS["model"]
     # Its experiment says whether a network has pretrained weights, the scale says all else.
     always = SHARED_BY_COMMON if reference.is_common else SHARED
     shared = [*always, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == WEIGHTS:
-        upstream.model = {each: upstream.model._get_node(each) for each in own}
-        shared += [f"model.{each}" for each in config.model if each not in own]
-    if reference.is_common and CACHE in config.dataset and CACHE in upstream.dataset:
-        upstream.dataset[CACHE] = config.dataset[CACHE]
-    for each in shared:
-        *parents, last = each.split(".")
-        mine: Any = OmegaConf.select(config, ".".join(parents)) if parents else config
-        node = mine._get_node(last)  # not resolved: a reference is one to the upstream run's own
-        value = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
-        OmegaConf.update(upstream, each, value, merge=False, force_add=True)
-    return upstream
+        shared += [f"model.{each}" for each in config.model if each not in RUN_SETTINGS["model"]]
+    if reference.is_common and CACHE in config.dataset:
+        shared.append(f"dataset.{CACHE}")
+    values = {each: _as_written(config, each) for each in shared}
+    content = pickle.dumps(values)
+    return _upstream_config(reference, config.scale.name, content, key == WEIGHTS, own_folders())
+
+
+def _as_written(config: DictConfig, key: str) -> Any:
+    *parents, last = key.split(".")
+    mine: Any = OmegaConf.select(config, ".".join(parents)) if parents else config
+    node = mine._get_node(last)  # not resolved: a reference is one to the upstream run's own
+    return OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
+
+
+@lru_cache(maxsize=256)
+def _upstream_config(
+    reference: Reference, scale: str, values: bytes, with_network: bool, own: str
+) -> tuple[DictConfig, dict[str, Any]]:
+    del own  # of `compose`
+    upstream = compose([f"+experiment={reference.experiment}", f"scale={scale}"])
+    if with_network:
+        own_settings = RUN_SETTINGS["model"]
+        upstream.model = {each: upstream.model._get_node(each) for each in own_settings}
+    for each, value in pickle.loads(values).items():  # noqa: S301 - made above
+        if each != f"dataset.{CACHE}" or CACHE in upstream.dataset:
+            OmegaConf.update(upstream, each, value, merge=False, force_add=True)
+    return upstream, resolved(upstream)
 
 
 def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
@@ -226,7 +246,7 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     config = OmegaConf.create(dict(settings))
     _override(config, overrides)
     config.model.weights = None  # the checkpoint holds them all
-    return _spec_of(config, (), ()).check()
+    return _spec_of(resolved(config), (), ()).check()
 
 
 def _override(config: DictConfig, overrides: Sequence[str]) -> None:

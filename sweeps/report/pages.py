@@ -84,7 +84,8 @@ class TableView:
         self.claims = "\n".join(claim_lines(self.frame))
         grids = [replace(grid_of(result, MARKDOWN), title=""), *grids_of(result)]
         self.grids = list(map(markdown, grids)) if self.is_run else []
-        self.drawn = drawn_of(result) if self.is_run else None
+        rows = {label for label, _ in result.runs}
+        self.drawn = drawn_of(result) if len(rows) > 1 else None  # one row compares nothing
         file = f"{request.name.replace('/', '-')}_{request.variant}.svg"
         self.figure = file if self.drawn is not None else ""
         count = str(len(seeds)) if seeds == tuple(range(len(seeds))) else ",".join(map(str, seeds))
