@@ -86,6 +86,7 @@ def averaged() -> list[float | None]:
     return [None if each.grad is None else float(each.grad[1]) for each in parameters]
 
 
+@pytest.mark.slow
 def test_parts_wholes_and_sums() -> None:
     entries = torch.arange(2 * B).view(B, 2)
     ranks = sum(range(SIZE))

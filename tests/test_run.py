@@ -298,6 +298,7 @@ def test_run_on_days_and_nights_counts_every_image(trained: Trained) -> None:
     assert scores == pytest.approx(scores_by_hand(counts))
 
 
+@pytest.mark.slow
 def test_statistics_of_each_domain_change_only_the_counts(trained: Trained, call: Call) -> None:
     folder = trained(*NIGHT)
     files = {path: path.read_bytes() for path in folder.glob("*") if path.is_file()}
@@ -351,6 +352,7 @@ def test_night_images_are_predicted_by_the_targets_head(
         assert found.any() == scores
 
 
+@pytest.mark.slow
 def test_chain_without_validation_split_reports_its_last_checkpoints(
     call: Call, tmp_path: Path
 ) -> None:

@@ -79,6 +79,7 @@ def kept_bytes(net: nn.Module) -> int:
     return sum(t.untyped_storage().nbytes() for at, t in kept.items() if at not in own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "changes", "dtype"),
     [*((*case, None) for case in CASES), ("mask2former", {}, torch.bfloat16)],

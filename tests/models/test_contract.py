@@ -153,6 +153,7 @@ CMNEXT = (10_287_337, 39_686_825, 58_686_017, 90_012_773, 116_560_396, 148_971_4
 SWIN = {"t": 74.92, "s": 117.56, "b": 193.50}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("yaml", "num_classes", "changes", "expected"),
     [

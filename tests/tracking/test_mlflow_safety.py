@@ -102,6 +102,7 @@ def test_a_slow_server_and_a_pipe_are_given_up(
             assert reason in error
 
 
+@pytest.mark.slow
 def test_a_held_lock_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
