@@ -338,16 +338,16 @@ def _compared(archive: Path) -> Iterator[Compared]:
 
 def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.config.compose import compose, flatten
-    from rgbt.config.stored_config import read_settings
-    from rgbt.runs.run_spec import NOT_IN_KEY
+    from rgbt.runs.run_spec import NOT_IN_KEY, settings_digest
     from rgbt.runs.specify import requested_run
 
     words = stored.description.overrides
     spec = requested_run(compose(words), words)
-    if spec.key == stored.key:
+    if spec.has_code and spec.key == stored.key:
         return Compared(path, "same")
-    before = flatten(read_settings(stored.folder / "config.yaml"))
-    now, none = flatten(spec.plain), object()
+    if not spec.has_code and settings_digest(spec.plain) == settings_digest(stored.settings):
+        return Compared(path, "same")
+    before, now, none = flatten(stored.settings), flatten(spec.plain), object()
     differing = [
         key
         for key in sorted(before.keys() | now.keys())

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError
+from rgbt.config.stored_config import read_settings
 from rgbt.files.plain_files import check_links
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.names import in_percent
@@ -66,6 +67,11 @@ class RunResult:
     def fingerprint(self) -> str:
         """Fingerprint of the data set that the run was made on."""
         return str(self.result["dataset"])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Plain values of its configuration, from which nothing is built."""
+        return read_settings(self.folder / "config.yaml")
 
     @property
     def description(self) -> Description:

@@ -257,6 +257,12 @@ class RunSpec:
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
+    def has_code(self) -> bool:
+        """Whether the checkout of an external network is here, without which it has no key."""
+        model = self.plain["model"]
+        return model.get("_target_") != EXTERNAL or bool(checkout_code(model))
+
+    @property
     def drawn(self) -> SourceSeeds:
         """The seed of every source of random draws."""
         own = (self.seeds.weights, self.seeds.order, self.seeds.masks)
@@ -397,7 +403,8 @@ def settings_digest(plain: Mapping[str, Any]) -> str:
     """12 hexadecimal digits of the settings in the run key as they are written, without content.
 
     A checkpoint holds them, so that a ``config.yaml`` that was changed since is noticed without the
-    files and upstream runs that the key depends on.
+    files and upstream runs that the key depends on. Runs of a checkout that is not here are told by
+    them.
     """
     places = {"model": ("weights", "checkout"), "domains": ("source", "target")}
     settings = {

@@ -19,7 +19,6 @@ from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
-from rgbt.config.stored_config import read_settings
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
@@ -104,10 +103,9 @@ class StoredRuns:
 
 def _settings_of(run: RunResult) -> tuple[str, str, str, str, str]:
     """Kind of images, scale, initial weights, lists and machine of a run."""
-    config = run.folder / "config.yaml"
-    if not config.is_file():
+    if not (run.folder / "config.yaml").is_file():
         return "unknown", "unknown", run.key, run.lists, run.machine
-    settings = read_settings(config)
+    settings = run.settings
     seed, scale = str(settings["seed"]), str(settings["scale"]["name"])
     images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
     start = str(settings.get("pretrained") or settings["model"].get("weights") or "")

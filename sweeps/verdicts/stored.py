@@ -10,6 +10,7 @@ from typing import get_args
 
 from rgbt.checks import InputError
 from rgbt.runs.result import RunResult
+from rgbt.runs.run_spec import RunSpec, settings_digest
 from sweeps.point import Outcome, Point
 from sweeps.table.cells import ScoredTable, score, size_marks
 from sweeps.table.efficiency import network_sizes
@@ -44,6 +45,14 @@ class FinishedRuns:
             except (InputError, KeyError, ValueError, TypeError) as error:
                 self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
 
+    def run_of(self, spec: RunSpec) -> RunResult | None:
+        """The run of a specification; where its checkout is not here, that of its settings."""
+        runs = self.by_seed[spec.seed]
+        if spec.has_code:
+            return runs.get(spec.key)
+        own = settings_digest(spec.plain)
+        return next((run for run in runs.values() if settings_digest(run.settings) == own), None)
+
     def __iter__(self) -> Iterator[RunResult]:
         return (run for by_key in self.by_seed.values() for run in by_key.values())
 
@@ -65,12 +74,12 @@ def stored_runs(
             continue
         try:
             spec = planner.specify((*planner.base, *words), checked=checked)
-            keys = {seed: spec.with_seed(seed).key for seed in seeds}
+            found = {seed: finished.run_of(spec.with_seed(seed)) for seed in sorted(seeds)}
         except InputError as error:
             errors.append(error)
             continue
-        for seed, key in sorted(keys.items()):
-            if run := finished.by_seed[seed].get(key):
+        for seed, run in found.items():
+            if run is not None:
                 runs[row.label, seed] = Outcome(Point(row.label, ()), "finished", results=(run,))
     if errors and len(errors) == len(rows):
         raise errors[0]  # the command is wrong, and not a row

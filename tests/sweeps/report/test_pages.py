@@ -17,13 +17,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from analysis.archive import add
+from analysis.archive import _compared, add
 from rgbt.checks import InputError
 from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.result import RunResult
 from sweeps.report.__main__ import entry, report_of
 from sweeps.report.pages import Report
 from tests.commands import Call
+from tests.models.external.standins import STACKED, write_checkout
 from tests.sweeps.report.planted import plant
 
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
@@ -110,6 +111,34 @@ def test_own_table_shows_values_verdicts_and_their_basis(report: Report) -> None
     assert "    - A reading of ours." in text
     assert "- `waits`: Theirs is below low. **Not run.** (Sec. IV)" in text
     assert "rgbt reproduce table=my/planted seeds=3\n" in text
+
+
+def test_rows_of_a_checkout_that_is_not_here_are_found_by_their_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_checkout(tmp_path / "Net", {"model/net.py": STACKED})
+    own, rows = yaml.safe_load(OWN), []
+    for label, lr in (("low", 0.1), ("high", 0.2)):
+        words = ["model=external", "model.checkout=Net", "model.constructor=model.net:Net"]
+        rows.append(
+            {"label": label, "experiment": "mfnet", "overrides": [*words, f"optimizer.lr={lr}"]}
+        )
+    table = {**own, "claims": own["claims"][:1], "rows": rows}
+    (tmp_path / "tables" / "my").mkdir(parents=True)
+    (tmp_path / "tables" / "my" / "net.yaml").write_text(yaml.safe_dump(table))
+    for folder in plant(tmp_path / "runs", "my/net", SHARES, scale="paper"):
+        add(RunResult(folder), tmp_path / "archive")
+    here = made().page("my")
+    assert "| high | ours | 3 | **59.79 " in here
+    shutil.rmtree(tmp_path / "Net")
+    assert made().page("my") == here
+    assert made(Path("none"), tmp_path / "archive").page("my") == here
+    assert [each.state for each in _compared(tmp_path / "archive")] == ["same"] * 6
+    (tmp_path / "tables" / "my" / "net.yaml").write_text(
+        yaml.safe_dump(table).replace("0.2", "0.3")
+    )
+    assert "| high | ours |" not in made().page("my")
 
 
 def test_runs_of_one_start_are_apart_with_a_warning(report: Report) -> None:
