@@ -342,7 +342,8 @@ def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.runs.specify import requested_run
 
     words = stored.description.overrides
-    spec = requested_run(compose(words), words)
+    # The command of an upstream run is that of its experiment, without the seed.
+    spec = requested_run(compose(words), words).with_seed(int(stored.settings["seed"]))
     if spec.has_code and spec.key == stored.key:
         return Compared(path, "same")
     if not spec.has_code and settings_digest(spec.plain) == settings_digest(stored.settings):
