@@ -84,21 +84,21 @@ def select_rows(table: Table, text: str) -> Table:
 def check_equal_runs(request: TableRequest, planner: Planner) -> None:
     """Refuse rows that are one run with the same scores, unless the table says so (`same_as`).
 
-    Rows that cannot be composed are left to the planning.
+    Rows that cannot be composed or lack a checkout are left to the planning.
     """
     origin = _origins(request.table)
     seen: dict[tuple[Any, ...], str] = {}
     for row in request.trained_rows:
         try:
-            spec = planner.specify((*planner.base, *request.overrides(row.label, 0)))
+            key = planner.specify((*planner.base, *request.overrides(row.label, 0))).key
         except InputError:
             continue
         metrics = [metric_of(each, row) for each in request.table.columns if is_counted(each)]
-        same = seen.setdefault((spec.key, *metrics), row.label)
+        same = seen.setdefault((key, *metrics), row.label)
         if origin[same] != origin[row.label]:
             raise InputError(
                 f"the rows '{same}' and '{row.label}' of {request.name} would be the same run "
-                f"({spec.key}) at scale={request.scale}, form={request.form}; remove the override "
+                f"({key}) at scale={request.scale}, form={request.form}; remove the override "
                 f"that makes them equal, or write same_as: {same} in the table."
             )
 
