@@ -11,11 +11,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# An empty value lets Python keep compiled modules: the tests start many processes.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Up to four processes, each with modules of its own. A process that has nothing left takes tests from
 # the end of another's list, so that tests of a module mostly stay together and share its fixtures.
 # `make test SPREAD=` runs one after the other.
-# An empty value lets Python keep compiled modules: the tests start many processes.
-export PYTHONDONTWRITEBYTECODE :=
 SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
 
 # What is spelled: tests misspell names on purpose.

@@ -338,17 +338,15 @@ def _compared(archive: Path) -> Iterator[Compared]:
 
 def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.config.compose import compose, flatten
-    from rgbt.runs.run_spec import NOT_IN_KEY, settings_digest
+    from rgbt.runs.run_spec import NOT_IN_KEY
     from rgbt.runs.specify import requested_run
 
-    words = stored.description.overrides
+    words, settings = stored.description.overrides, stored.settings
     # The command of an upstream run is that of its experiment, without the seed.
-    spec = requested_run(compose(words), words).with_seed(int(stored.settings["seed"]))
-    if spec.has_code and spec.key == stored.key:
+    spec = requested_run(compose(words), words).with_seed(int(settings["seed"]))
+    if spec.is_run(stored):
         return Compared(path, "same")
-    if not spec.has_code and settings_digest(spec.plain) == settings_digest(stored.settings):
-        return Compared(path, "same")
-    before, now, none = flatten(stored.settings), flatten(spec.plain), object()
+    before, now, none = flatten(settings), flatten(spec.plain), object()
     differing = [
         key
         for key in sorted(before.keys() | now.keys())

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
@@ -31,6 +31,9 @@ from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code
+
+if TYPE_CHECKING:
+    from rgbt.runs.result import RunResult
 
 # The setting that names the weights that a network starts from.
 WEIGHTS = "model.weights"
@@ -256,8 +259,14 @@ class RunSpec:
         )
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
-    @property
-    def has_code(self) -> bool:
+    def is_run(self, run: RunResult) -> bool:
+        """Whether a stored run is this one: by its key, or without the checkout by its settings."""
+        if self._has_code:
+            return self.key == run.key
+        return settings_digest(self.plain) == settings_digest(run.settings)
+
+    @cached_property
+    def _has_code(self) -> bool:
         """Whether the checkout of an external network is here, without which it has no key."""
         model = self.plain["model"]
         return model.get("_target_") != EXTERNAL or bool(checkout_code(model))

@@ -10,7 +10,7 @@ from typing import get_args
 
 from rgbt.checks import InputError
 from rgbt.runs.result import RunResult
-from rgbt.runs.run_spec import RunSpec, settings_digest
+from rgbt.runs.run_spec import RunSpec
 from sweeps.point import Outcome, Point
 from sweeps.table.cells import ScoredTable, score, size_marks
 from sweeps.table.efficiency import network_sizes
@@ -46,12 +46,8 @@ class FinishedRuns:
                 self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
 
     def run_of(self, spec: RunSpec) -> RunResult | None:
-        """The run of a specification; where its checkout is not here, that of its settings."""
-        runs = self.by_seed[spec.seed]
-        if spec.has_code:
-            return runs.get(spec.key)
-        own = settings_digest(spec.plain)
-        return next((run for run in runs.values() if settings_digest(run.settings) == own), None)
+        """The run of a specification (`RunSpec.is_run`)."""
+        return next((run for run in self.by_seed[spec.seed].values() if spec.is_run(run)), None)
 
     def __iter__(self) -> Iterator[RunResult]:
         return (run for by_key in self.by_seed.values() for run in by_key.values())

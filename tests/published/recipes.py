@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
+from rgbt.files.yaml_files import read_yaml
 
 FOLDER = Path(__file__).parent
 FILES = ("crm", "networks", "cmnext", "dinov2", "thesis", "self_training", "data", "run")
@@ -133,7 +133,7 @@ def flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _file(name: str) -> Any:
-    return yaml.load((FOLDER / f"{name}.yaml").read_text(), yaml.CSafeLoader)  # noqa: S506
+    return read_yaml(FOLDER / f"{name}.yaml")
 
 
 def _section(group: str, text: Mapping[str, Any]) -> Section:

@@ -113,7 +113,7 @@ def test_own_table_shows_values_verdicts_and_their_basis(report: Report) -> None
     assert "rgbt reproduce table=my/planted seeds=3\n" in text
 
 
-def test_rows_of_a_checkout_that_is_not_here_are_found_by_their_settings(
+def test_rows_of_a_missing_checkout_are_found_by_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
