@@ -179,6 +179,8 @@ class Report:
         metrics = (names.MIOU, names.VAR)
         for (images, scale), kind in frame.groupby(["images", "scale"]):
             lines = []
+            words = [method.split() for method in kind["method"]]
+            every = [word for word in words[0][1:] if all(word in other for other in words)]
             for (method, _), each in kind.groupby(["method", "dataset"]):
                 many = len(each) > 1
                 scores = [
@@ -186,11 +188,14 @@ class Report:
                     for name in metrics
                 ]
                 seeds = ", ".join(map(str, sorted(each["seed"])))
-                tables = "; ".join(dict.fromkeys("; ".join(each["tables"]).split("; ")))
-                lines.append((method, seeds, *scores, duration(each["time"].median()), tables))
+                tables = "; ".join(dict.fromkeys(filter(None, "; ".join(each["tables"]).split("; "))))
+                own = " ".join(word for word in method.split() if word not in every)
+                lines.append((f"`{own}`", seeds, *scores, duration(each["time"].median()), tables))
             header = ("method", "seeds", *metrics, "time", "rows of")
             title = f"{len(kind)} runs on {images} images, scale={scale}"
-            grids.append(markdown(TextTable(title, header, tuple(lines))))
+            grid = markdown(TextTable(title, header, tuple(lines)))
+            common = " ".join(word for word in every if word != f"scale={scale}")
+            grids.append(f"{grid}\n\nAll of them with `{common}`." if common else grid)
         known = pd.DataFrame(facts)
         texts = {name: sorted(set(known[name].dropna()) - {""}) for name in known}
         origin = tuple((name, ", ".join(each) or ABSENT) for name, each in texts.items())
