@@ -188,7 +188,7 @@ class Report:
                     for name in metrics
                 ]
                 seeds = ", ".join(map(str, sorted(each["seed"])))
-                tables = "; ".join(dict.fromkeys(filter(None, "; ".join(each["tables"]).split("; "))))
+                tables = "; ".join(dict.fromkeys(name for run in each["tables"] for name in run))
                 own = " ".join(word for word in method.split() if word not in every)
                 lines.append((f"`{own}`", seeds, *scores, duration(each["time"].median()), tables))
             header = ("method", "seeds", *metrics, "time", "rows of")
@@ -213,7 +213,7 @@ class Report:
             "seed": int(tags["rgbt.seed"]),
             **{name: value(name, counts, counts.absent) for name in (names.MIOU, names.VAR)},
             "time": float(run.result["seconds_of_last_process"]),
-            "tables": "; ".join(sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG))),
+            "tables": sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG)),
         }
 
     @property
