@@ -193,6 +193,7 @@ class Report:
                 lines.append((f"`{own}`", seeds, *scores, duration(each["time"].median()), tables))
             header = ("method", "seeds", *metrics, "time", "rows of")
             title = f"{len(kind)} runs on {images} images, scale={scale}"
+            title += f", {duration(kind['time'].sum())} in all"
             grid = markdown(TextTable(title, header, tuple(lines)))
             common = " ".join(word for word in every if word != f"scale={scale}")
             grids.append(f"{grid}\n\nAll of them with `{common}`." if common else grid)

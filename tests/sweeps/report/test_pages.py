@@ -171,7 +171,7 @@ def test_claims_are_counted_once_and_shown_for_every_basis(report: Report) -> No
 
 def test_index_has_runs_with_seeds_spread_and_time(report: Report) -> None:
     text = report.page("index")
-    assert "**6 runs on synthetic images, scale=demo**" in text
+    assert "**6 runs on synthetic images, scale=demo, 6 min in all**" in text
     assert text.index("## Claims by verdict") < text.index("## Runs") < text.index("| git commit |")
     line = next(line for line in text.splitlines() if line.startswith("| `baseline` |"))
     cells = [cell.strip() for cell in line.split("|")]
