@@ -49,8 +49,8 @@ COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
 # Files of a run folder that are archived: its counts, and what is kept as it is.
 TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
 
+# LZMA for numbers whose bytes are stored apart, so that neither context nor place tells anything.
 BYTES = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "pb": 0}]
-# Filter for bytes that do not depend on their place in a word.
 
 PROVENANCE = (
     "started",
@@ -214,7 +214,7 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
         write_atomic(path, lzma.compress(file.getvalue(), preset=9))
     header = fields | {"counts": [array.dtype.str, *array.shape], "shared": name}
     images_last = np.moveaxis(array, 0, -1)
-    is_there = images_last != 0  # few are; apart, the rest is a sixth smaller
+    is_there = images_last != 0  # most counts are 0: a bit each makes the file a sixth smaller
     planes = images_last[is_there].view(np.uint8).reshape(-1, array.itemsize).T
     body = np.packbits(is_there).tobytes() + planes.tobytes()
     return lzma.compress(json.dumps(header).encode() + b"\n" + body, filters=BYTES)

@@ -192,8 +192,8 @@ class Report:
                 own = " ".join(word for word in method.split() if word not in every)
                 lines.append((f"`{own}`", seeds, *scores, duration(each["time"].median()), tables))
             header = ("method", "seeds", *metrics, "time", "rows of")
-            title = f"{len(kind)} runs on {images} images, scale={scale}"
-            title += f", {duration(kind['time'].sum())} in all"
+            hours = duration(kind["time"].sum())
+            title = f"{len(kind)} runs on {images} images, scale={scale}, {hours} in all"
             grid = markdown(TextTable(title, header, tuple(lines)))
             common = " ".join(word for word in every if word != f"scale={scale}")
             grids.append(f"{grid}\n\nAll of them with `{common}`." if common else grid)

@@ -270,7 +270,7 @@ def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -
     page = found.html()
     assert "<script>alert" not in page + found.page("index")
     assert "/home/me" not in page
-    assert "lt;script&gt;alert(1)" in page
+    assert "&amp;lt;script&gt;alert(1)" in page
 
 
 @pytest.mark.slow
