@@ -2,12 +2,12 @@
 
 usage: rgbt archive add run=all, rgbt archive check, or rgbt archive rekey
 
-``results/<key>.zip`` holds the configuration, the result, the provenance and all counts of a run.
-What runs on the same images share is in ``results/shared/`` once: names of images and classes, and
-the number of pixels of each label. Of the counts a run then keeps the wrong predictions only: the
-right ones are what is left of the labelled pixels. Unpacked, a run is a folder that
-`rgbt.runs.result.RunResult` reads; its counts are equal, bit for bit. No file depends on another
-run, so two machines that add runs never conflict.
+``results/<key>.zip`` holds the configuration, the result, the provenance and the counts of a run on
+the test images. What runs share is in ``results/shared/`` once: names of images and classes, pixels
+of each label, and most words of a configuration. Of the counts a run then keeps the wrong
+predictions only: the right ones are what is left of the labelled pixels. Unpacked, a run is a
+folder that `rgbt.runs.result.RunResult` reads; its counts are equal, bit for bit. No file depends
+on another run, so two machines that add runs never conflict.
 
 Exit code 1 of ``check``: a run is damaged, or its command now has another key.
 """
@@ -23,6 +23,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -46,41 +47,21 @@ from rgbt.terminal import plain_text, print_rich, rich_table, warn
 
 SHARED = "shared"
 COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
-# Files of a run folder that are archived: its counts, and what is kept as it is.
-TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
+# Files of a run folder that are archived: its counts, its texts, and what is kept as it is.
+TEXTS = ("config.yaml", "run.json", "result.json")
+ROBUSTNESS = "evaluations/robustness/*/*.json"
+
+# Member with all texts of a run, which repeat most of those of another run in ``shared/``.
+PACKED_TEXTS = "texts.json.z"
 
 # LZMA for numbers whose bytes are stored apart, so that neither context nor place tells anything.
 BYTES = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "pb": 0}]
 
 PROVENANCE = (
-    "started",
-    "command",
-    "git_commit",
-    "git_dirty",
-    "code",
-    "python",
-    "threads",
-    "platform",
-    "cpu",
-    "cpu_usable",
-    "gpus",
-    "cuda",
+    "started command git_commit git_dirty code python threads platform cpu cpu_usable gpus cuda"
 )
-# Entries of the provenance, and the packages whose versions are archived. Paths and the name of
-# the machine are of no use elsewhere.
+# Archived entries of the provenance, and packages; paths are of no use on another machine.
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hydra-core", "optuna")
-
-DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    EOFError,
-    NotImplementedError,
-    KeyError,
-    ValueError,
-    TypeError,
-    OSError,
-)
 
 
 def archived(folder: Path) -> list[Path]:
@@ -106,33 +87,30 @@ def unpack(path: Path, folder: Path | None = None) -> RunResult:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         unpacked = Path(scratch, "run")
-        try:
+        with _undamaged(path):
             _write_members(path, unpacked)
-        except DAMAGED as error:
-            raise InputError(f"{path} is damaged ({one_line(error)}).") from error
         result = RunResult(unpacked).result
         if result.get("key", key) != key:
             raise InputError(f"{path} holds the run {result['key']}; rename the file.")
         target.parent.mkdir(exist_ok=True)
-        try:
+        with suppress(OSError):  # another process was faster
             unpacked.rename(target)
-        except OSError:
-            if not target.is_dir():  # another process was not faster
-                raise
     return RunResult(target)
 
 
 def _write_members(path: Path, folder: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.namelist():
-            file = folder / entry.removesuffix(".xz")
-            if not file.resolve().is_relative_to(folder.resolve()):
-                raise ValueError(f"'{entry}' leads out of the folder")
-            file.parent.mkdir(parents=True, exist_ok=True)
-            if entry.endswith(".npz.xz"):
-                _unpack_counts(archive.read(entry), path.parent / SHARED).save(file)
-            else:
-                write_atomic(file, archive.read(entry))
+    shared = path.parent / SHARED
+    members = _members(path)
+    members |= _unpack_texts(members.pop(PACKED_TEXTS), shared)
+    for name, content in members.items():
+        file = folder / name.removesuffix(".xz")
+        if not file.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"'{name}' leads out of the folder")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith(".npz.xz"):
+            _unpack_counts(content, shared).save(file)
+        else:
+            write_atomic(file, content)
 
 
 def counts_of(folder: Path) -> list[Path]:
@@ -151,7 +129,8 @@ def add(run: RunResult, folder: Path) -> Path:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
     members = _packed(run, folder / SHARED)
     path = folder / f"{run.key}.zip"
-    old = _stored(path) if path.exists() else {}
+    with _undamaged(path):
+        old = _members(path) if path.exists() else {}
     if any(old[each] != members[each] for each in old.keys() & members if each.endswith(".xz")):
         content, old = _zipped(members), {}
         path = folder / f"{run.key}-{_digest(content)[:8]}.zip"
@@ -160,29 +139,36 @@ def add(run: RunResult, folder: Path) -> Path:
     return path
 
 
-def _stored(path: Path) -> dict[str, bytes]:
-    """The members of an archived run; InputError: the file is damaged."""
+def _members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {name: archive.read(name) for name in archive.namelist()}
-    except DAMAGED as error:
+        yield
+    except Exception as error:  # of any kind, by what is damaged
         raise InputError(f"{path} is damaged ({one_line(error)}).") from error
 
 
 def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
     """The members of ``<key>.zip``; shared arrays are written to `shared`."""
     shared.mkdir(parents=True, exist_ok=True)
-    texts = [path for name in TEXTS for path in sorted(run.folder.glob(name))]
-    members = {path.relative_to(run.folder).as_posix(): path.read_bytes() for path in texts}
+    texts = {name: (run.folder / name).read_bytes().decode() for name in TEXTS}
     entries = [
-        {name: entry.get(name) for name in PROVENANCE}
+        {name: entry.get(name) for name in PROVENANCE.split()}
         | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}
         for entry in run.provenance
     ]
-    members["provenance.json"] = json.dumps(entries, indent=1).encode()
+    texts["provenance.json"] = json.dumps(entries, indent=1)
+    members = {PACKED_TEXTS: _packed_texts(json.dumps(texts).encode(), shared)}
+    for path in sorted(run.folder.glob(ROBUSTNESS)):
+        members[path.relative_to(run.folder).as_posix()] = path.read_bytes()
     for path in counts_of(run.folder):
-        name = path.relative_to(run.folder).as_posix()
-        members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
+        if (counts := Counts.load(path)).split != "val":  # no table reads those
+            name = path.relative_to(run.folder).as_posix()
+            members[f"{name}.xz"] = _packed_counts(counts, shared)
     return members
 
 
@@ -191,9 +177,25 @@ def _zipped(members: Mapping[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in members.items():
-            how = zipfile.ZIP_STORED if name.endswith(".xz") else zipfile.ZIP_DEFLATED
+            how = zipfile.ZIP_DEFLATED if name.endswith(".json") else zipfile.ZIP_STORED
             archive.writestr(zipfile.ZipInfo(name), content, how)  # the time of an info is fixed
     return file.getvalue()
+
+
+def _packed_texts(texts: bytes, shared: Path) -> bytes:
+    """The name of other texts in ``shared/``, the first ones, and what `texts` have beyond them."""
+    known = min(shared.glob("*.json"), default=shared / f"{_digest(texts)}.json")
+    if not known.exists():
+        write_atomic(known, texts)
+    packer = zlib.compressobj(9, wbits=-zlib.MAX_WBITS, zdict=known.read_bytes())
+    return known.stem.encode() + packer.compress(texts) + packer.flush()
+
+
+def _unpack_texts(content: bytes, shared: Path) -> dict[str, bytes]:
+    known = shared / f"{Path(content[:16].decode()).name}.json"
+    unpacker = zlib.decompressobj(-zlib.MAX_WBITS, zdict=_checked(known.read_bytes(), known))
+    texts = json.loads(unpacker.decompress(content[16:]) + unpacker.flush())
+    return {name: text.encode() for name, text in texts.items()}
 
 
 def _packed_counts(counts: Counts, shared: Path) -> bytes:
@@ -202,11 +204,12 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
     arrays = {name: np.array(fields.pop(name)) for name in ("names", "classes")}
     arrays["night"] = np.array(fields.pop("night") or (), bool)
     arrays["unscored"] = np.array(fields.pop("unscored"), str)
-    # Only the rows of confusion matrices sum to the pixels of the label.
-    if details_of(counts.partition) is None and protocol_of(counts.partition) is None:
-        arrays["labelled"] = array.sum(-1, dtype=np.int64)
+    # Details are no matrices, and the rows of triples are predictions.
+    if details_of(counts.partition) is None and protocol_of(counts.partition) != "triples":
         array = array.copy()
-        array[..., range(array.shape[-1]), range(array.shape[-1])] = 0
+        rows, right = _by_label(array, counts.partition)
+        arrays["labelled"] = rows.sum(-1, dtype=np.int64)
+        right[...] = 0
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     name = _digest(file.getvalue())
@@ -218,6 +221,17 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
     planes = images_last[is_there].view(np.uint8).reshape(-1, array.itemsize).T
     body = np.packbits(is_there).tobytes() + planes.tobytes()
     return lzma.compress(json.dumps(header).encode() + b"\n" + body, filters=BYTES)
+
+
+def _by_label(
+    counts: NDArray[np.integer], partition: str
+) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Views of `counts`: all predictions of a label (..., K, P), and the right ones (..., K)."""
+    classes = counts.shape[-1]
+    if protocol_of(partition) is None:
+        return counts, np.einsum("...cc->...c", counts)
+    pairs = counts.reshape(len(counts), -1, classes + 1, classes, classes)[:, :, :-1]
+    return pairs.reshape(*pairs.shape[:-2], -1), np.einsum("...ccc->...c", pairs)
 
 
 def _unpack_counts(content: bytes, shared: Path) -> Counts:
@@ -232,19 +246,24 @@ def _unpack_counts(content: bytes, shared: Path) -> Counts:
     images_last[is_there] = np.ascontiguousarray(flat).view(kind).ravel()
     array = np.ascontiguousarray(np.moveaxis(images_last, -1, 0))
     if "labelled" in arrays:
-        classes = range(array.shape[-1])
-        array[..., classes, classes] = arrays["labelled"] - array.sum(-1)
+        rows, right = _by_label(array, fields["partition"])
+        right[...] = arrays["labelled"] - rows.sum(-1)
     fields |= {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
     return Counts(**fields, counts=array, night=tuple(arrays["night"].tolist()) or None)
 
 
 def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:
     """The arrays of a file that is named by the digest of its content."""
-    content = lzma.decompress((shared / f"{Path(name).name}.npz.xz").read_bytes())
-    if _digest(content) != name:
-        raise ValueError(f"shared/{name} does not match its digest")
+    file = shared / f"{Path(name).name}.npz.xz"
+    content = _checked(lzma.decompress(file.read_bytes()), file)
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def _checked(content: bytes, file: Path) -> bytes:
+    if _digest(content) != file.name.partition(".")[0]:
+        raise ValueError(f"shared/{file.name} does not match its digest")
+    return content
 
 
 def _digest(content: bytes) -> str:

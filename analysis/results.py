@@ -44,18 +44,9 @@ EVALUATIONS, ROBUSTNESS = "evaluations", "robustness"
 CLEAN, ALL = "clean", "all"
 
 SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
-# Columns of `score_frame` and `results`.
-COLUMNS = (
-    "run",
-    "experiment",
-    "group",
-    "seed",
-    "split",
-    "condition",
-    "severity",
-    "partition",
-    *SCORE_COLUMNS,
-)
+OF_FILES = ("run", "experiment", "group", "seed", "split", "condition", "severity", "partition")
+COLUMNS = (*OF_FILES, *SCORE_COLUMNS)
+# Columns of `score_frame`, of what they are, and of `results`.
 
 # Words of messages for what a list may contain.
 RUNS = "runs, files of counts or a group"
@@ -254,7 +245,7 @@ def results(
             if not evaluations and each.path.parent != run.folder:
                 continue
             found = (*texts, each.seed, split, each.condition, each.severity, each.counts.partition)
-            of_file = dict(zip(COLUMNS, found, strict=False))
+            of_file = dict(zip(OF_FILES, found, strict=True))
             frames.append(score_frame(each.counts, absent).assign(**of_file))
     if not frames:
         return pd.DataFrame(columns=COLUMNS)

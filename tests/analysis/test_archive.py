@@ -42,6 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     folder.describe(describe(spec))
     folder.add_provenance({"git_commit": "a" * 40, "cwd": "/home/me", "packages": {"torch": "2"}})
     some(0, run=spec.key).save(folder.path / "counts_test.npz")
+    some(0, run=spec.key, split="val").save(folder.path / "counts_val.npz")
     (folder.path / "evaluations").mkdir()
     replace(some(1), night=(True, False) * 6).save(folder.path / "evaluations/test_rgb.npz")
     PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
@@ -66,7 +67,7 @@ def archived_in(folder: Path) -> Path:
 def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
     unpacked = unpack(archived_in(tmp_path), tmp_path / "unpacked")
     paths = [path for end in ("npz", "json") for path in sorted(run.folder.rglob(f"*.{end}"))]
-    names = {path.relative_to(run.folder).as_posix() for path in paths}
+    names = {path.relative_to(run.folder).as_posix() for path in paths} - {"counts_val.npz"}
     assert names == {
         path.relative_to(unpacked.folder).as_posix()
         for path in unpacked.folder.rglob("*.*")
@@ -108,8 +109,12 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
     wrong[..., 0, 0] -= 1
     before = len(list((tmp_path / "results/shared").iterdir()))
     replace(some(0), counts=wrong).save(run.folder / "counts_test.npz")
+    wrong = PAIRS.counts.copy()
+    wrong[:, 1, 3, 2] += wrong[:, 1, 1, 1]  # of pixels with label 1 in both frames
+    wrong[:, 1, 1, 1] = 0
+    replace(PAIRS, counts=wrong).save(run.folder / "evaluations/consistency_aligned_test.npz")
     add(run, tmp_path / "results")
-    assert len(list((tmp_path / "results/shared").iterdir())) == before == 4
+    assert len(list((tmp_path / "results/shared").iterdir())) == before == 5
 
 
 @pytest.mark.parametrize("damage", [0.3, 0.6, "shared", "/tmp/outside.txt", "../outside.txt"])
