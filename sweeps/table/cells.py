@@ -123,10 +123,11 @@ def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[st
 def _counts(outcome: Outcome, path: str, reader: Reader) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
+    run = outcome.results[0]
     try:
-        return outcome.missing.get(path) or reader(outcome.results[0], path)
+        return outcome.missing.get(path) or reader(run, path)
     except (InputError, OSError) as error:
-        return str(error)
+        return str(error).replace(f"{run.folder}/", "")  # equal reasons of seeds are joined
 
 
 def _value(metric: str, counts: Counts | str, table: Table) -> Value:

@@ -2,16 +2,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
+from sweeps.point import Outcome, Point
+from sweeps.table.cells import OWN_COUNTS, ScoredTable, TableCell, published, score, size_marks
 from sweeps.table.table import Column, Row
-from tests.sweeps.tabled import Made, counts_of, failed, outcome, right, table
+from tests.sweeps.tabled import FakeResult, Made, counts_of, failed, outcome, right, table
 
 ACC = Column(name="acc", metric="pixel_accuracy")
 RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
@@ -130,6 +133,18 @@ def test_score_failed_seed_keeps_reason() -> None:
     cell = scored((ACC,), runs).cells["a", "acc"]
     assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
     assert cell.reason == "seeds 1, 2: out of memory"
+
+
+class Uncounted(FakeResult):
+    def counts(self, path: str = OWN_COUNTS) -> Counts:
+        raise InputError(f"{self.folder}/{path} does not exist")
+
+
+def test_runs_without_counts_share_a_reason() -> None:
+    every: Any = [Uncounted(key, {}, folder=Path(key)) for key in "kl"]
+    points = [Outcome(Point(each.key, ()), "finished", results=(each,)) for each in every]
+    cell = scored((ACC,), {("a", seed): each for seed, each in enumerate(points)}).cells["a", "acc"]
+    assert cell.reason == f"seeds 0, 1: {OWN_COUNTS} does not exist"
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", 100.0)])
