@@ -155,7 +155,7 @@ def _undamaged(path: Path) -> Iterator[None]:
 def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
     """The members of ``<key>.zip``; shared arrays are written to `shared`."""
     shared.mkdir(parents=True, exist_ok=True)
-    texts = {name: (run.folder / name).read_bytes().decode() for name in TEXTS}
+    texts = {path.name: path.read_bytes().decode() for n in TEXTS for path in run.folder.glob(n)}
     entries = [
         {name: entry.get(name) for name in PROVENANCE.split()}
         | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}
