@@ -66,7 +66,7 @@ PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hyd
 
 def archived(folder: Path) -> list[Path]:
     """All runs of an archive, by key: ``<key>.zip``, ``<key>-<digest>.zip`` with other results."""
-    return sorted(folder.glob("*.zip"))
+    return sorted(folder.glob("*.zip"), key=lambda path: path.stem)  # the first results first
 
 
 def key_of(path: Path) -> str:
