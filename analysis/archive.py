@@ -23,7 +23,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -54,7 +54,7 @@ ROBUSTNESS = "evaluations/robustness/*/*.json"
 # Member with all texts of a run, which repeat most of those of another run in ``shared/``.
 PACKED_TEXTS = "texts.json.z"
 
-# LZMA for numbers whose bytes are stored apart, so that neither context nor place tells anything.
+# LZMA without contexts (lc) and alignment (pb): bytes of equal significance follow each other.
 BYTES = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "pb": 0}]
 
 PROVENANCE = (
@@ -93,14 +93,16 @@ def unpack(path: Path, folder: Path | None = None) -> RunResult:
         if result.get("key", key) != key:
             raise InputError(f"{path} holds the run {result['key']}; rename the file.")
         target.parent.mkdir(exist_ok=True)
-        with suppress(OSError):  # another process was faster
+        try:
             unpacked.rename(target)
+        except OSError:
+            if not target.is_dir():  # another process was not faster
+                raise
     return RunResult(target)
 
 
 def _write_members(path: Path, folder: Path) -> None:
-    shared = path.parent / SHARED
-    members = _members(path)
+    members, shared = _members(path), path.parent / SHARED
     members |= _unpack_texts(members.pop(PACKED_TEXTS), shared)
     for name, content in members.items():
         file = folder / name.removesuffix(".xz")
@@ -194,8 +196,8 @@ def _packed_texts(texts: bytes, shared: Path) -> bytes:
 def _unpack_texts(content: bytes, shared: Path) -> dict[str, bytes]:
     known = shared / f"{Path(content[:16].decode()).name}.json"
     unpacker = zlib.decompressobj(-zlib.MAX_WBITS, zdict=_checked(known.read_bytes(), known))
-    texts = json.loads(unpacker.decompress(content[16:]) + unpacker.flush())
-    return {name: text.encode() for name, text in texts.items()}
+    texts = unpacker.decompress(content[16:]) + unpacker.flush()
+    return {name: text.encode() for name, text in json.loads(texts).items()}
 
 
 def _packed_counts(counts: Counts, shared: Path) -> bytes:
@@ -223,9 +225,7 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
     return lzma.compress(json.dumps(header).encode() + b"\n" + body, filters=BYTES)
 
 
-def _by_label(
-    counts: NDArray[np.integer], partition: str
-) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+def _by_label(counts: NDArray[Any], partition: str) -> tuple[NDArray[Any], NDArray[Any]]:
     """Views of `counts`: all predictions of a label (..., K, P), and the right ones (..., K)."""
     classes = counts.shape[-1]
     if protocol_of(partition) is None:
