@@ -103,7 +103,8 @@ def count_predicted(
         joined = {name: np.concatenate([*by_set.values()]) for name, by_set in by_name.items()}
         sets = max(map(len, by_name.values()), default=0)
         partition = partition_name(protocol, sets, pairing.mark(data, protocol))
-        counts[protocol] = counts_of(data, split, joined, partition)
+        each_scene = counts_of(data, split, joined, partition)
+        counts[protocol] = each_scene.added(data.consistency.scenes_per_count)
     return Pairs(counts, tuple(kept.values()), tuple(records))
 
 

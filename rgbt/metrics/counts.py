@@ -85,6 +85,22 @@ class Counts:
             raise InputError(f"'{self.split}': image '{min(missing)}' is not counted.")
         return self._take([index_of[name] for name in wanted])
 
+    def added(self, number: int) -> Counts:
+        """The counts of `number` neighbours each, added; day and night stay apart.
+
+        Each is named after its first image and the number of the others: "00196D+9". Scores of all
+        images stay equal; intervals draw so many images together.
+        """
+        if number == 1:
+            return self
+        night = np.array(self.night or np.zeros(len(self.names)), bool)
+        kinds = np.flatnonzero(~night), np.flatnonzero(night)
+        groups = [kind[at : at + number] for kind in kinds for at in range(0, len(kind), number)]
+        firsts = self._take([int(group[0]) for group in groups])
+        names = (f"{name}+{len(g) - 1}" for name, g in zip(firsts.names, groups, strict=True))
+        sums = [self.counts[group].sum(0, dtype=self.counts.dtype) for group in groups]
+        return replace(firsts, counts=np.stack(sums), names=tuple(names))
+
     def parts(self) -> dict[str, Counts]:
         """Day and night, if the data set distinguishes them and the split holds both."""
         if self.night is None or len(set(self.night)) < 2:

@@ -157,12 +157,19 @@ class ViewSets:
         sets: names of published sets ("released_1" .. "released_3"), or CSV files with the columns
             yaw,pitch,roll in degrees. None: a run measures no consistency.
         splits: what a run measures at its end, with its best checkpoint.
+        scenes_per_count: neighbouring scenes whose counts are kept as one (`Counts.added`).
     """
 
     def __init__(
-        self, *, view: VirtualView, sets: Names, splits: tuple[Literal["val", "test"], ...]
+        self,
+        *,
+        view: VirtualView,
+        sets: Names,
+        splits: tuple[Literal["val", "test"], ...],
+        scenes_per_count: Annotated[int, Interval(ge=1, le=1000)] = 1,
     ) -> None:
         self.view, self.sets, self.splits = view, sets, splits
+        self.scenes_per_count = scenes_per_count
         if sets and not splits:
             raise InputError("consistency.splits: consistency.sets requires val or test.")
         self._triples = [read_angles(name) for name in sets]

@@ -134,6 +134,17 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
                 assert difference <= 0.004 * 48 * 64, (protocol, image, number)
 
 
+def test_counts_of_neighbouring_scenes_are_kept_as_one(data: Path) -> None:
+    whole, added = (
+        count_pairs(on_mfnet(data, *words), Decoder(), TEST, VIRTUAL).counts
+        for words in ((), ("consistency.scenes_per_count=2",))
+    )
+    for protocol, counts in whole.items():
+        assert len(added[protocol].names) < len(counts.names)
+        assert added[protocol].names == counts.added(2).names
+        assert np.array_equal(added[protocol].by_region(), counts.by_region())
+
+
 def test_unreadable_and_repeated_names_do_not_count(data: Path) -> None:
     whole = count_pairs(on_mfnet(data), Decoder(), TEST, VIRTUAL).counts
     first, *others = SPLITS["test"]

@@ -50,6 +50,23 @@ def test_sums_do_not_overflow_the_type_of_the_file() -> None:
     assert np.array_equal(example().by_region()[3], example().counts[:, 3].sum(0))
 
 
+def test_neighbours_are_added_and_day_and_night_stay_apart() -> None:
+    night = (False, True, False, True, False, True, True)
+    array = np.random.default_rng(1).integers(0, 1000, (7, 5, 2, 2)).astype(np.int32)
+    counts = replace(example(unscored=("car",)), counts=array, names=tuple("abcdefg"), night=night)
+    added = counts.added(2)
+    assert added.names == ("a+1", "e+0", "b+1", "f+1")
+    assert added.night == (False, False, True, True)
+    sums = array[[0, 4, 1, 5]] + np.stack([array[2], 0 * array[0], array[3], array[6]])
+    assert np.array_equal(added.counts, sums)
+    assert added.counts.dtype == np.int32
+    assert added.unscored == ("car",)
+    assert counts.added(1) is counts
+    unknown = replace(counts, night=None).added(3)
+    assert (unknown.names, unknown.night) == (("a+2", "d+2", "g+0"), None)
+    assert np.array_equal(unknown.whole(), counts.whole())
+
+
 def test_selected_images_keep_their_order_and_time() -> None:
     chosen = example(unscored=("car",)).select(["00003N", "00001D"])
     assert chosen.names == ("00003N", "00001D")
