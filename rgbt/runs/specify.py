@@ -54,6 +54,7 @@ CACHE = "cache_dir"
 CHECKOUT = "model.checkout"
 
 GROUPS = ("dataset", "metric", "prediction", "consistency")
+ADDED = "scenes_per_count"  # setting of consistency, by scale
 # Settings of a finished run that may be changed: the source of the images and the counting, and
 # where code lies.
 CHANGEABLE = (
@@ -254,6 +255,7 @@ def _override(config: DictConfig, overrides: Sequence[str]) -> None:
 
     Absent classes count by the convention of the data set that is measured, unless the run or
     `overrides` set ``metric.absent`` by hand. A partition of a user's own class may lack it.
+    ``consistency=views`` adds the counts of as many scenes as the scale of the run does.
     """
     absent = config.metric.get("absent")
     by_hand = absent not in (None, config.dataset.get("absent", "exclude"))
@@ -268,7 +270,10 @@ def _override(config: DictConfig, overrides: Sequence[str]) -> None:
     groups = [key for key, _, _ in changes if key in GROUPS]
     for group in groups:
         own = [f"{key}={value}" for key, value, path in changes if path.split(".")[0] == group]
+        before = config[group]
         config[group] = OmegaConf.to_container(compose(own)[group], resolve=True)
+        if group == "consistency" and not any(path.endswith(ADDED) for _, _, path in changes):
+            config[group][ADDED] = before.get(ADDED, 1)  # 1: a run before there was a choice
     known = flatten(cast("dict[str, Any]", OmegaConf.to_container(config)))
     for key, value, path in changes:
         if path.split(".")[0] in groups:

@@ -190,3 +190,19 @@ def test_absent_classes_follow_the_evaluated_data_set(
 ) -> None:
     spec = load_spec(stored(*trained), words)
     assert spec.plain["metric"]["absent"] == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["consistency=views"], 10),
+        (["consistency=views", "consistency.scenes_per_count=3"], 3),
+        (["consistency.scenes_per_count=3"], 3),
+    ],
+)
+def test_measured_later_as_many_scenes_are_added(words: list[str], expected: int) -> None:
+    spec = load_spec(stored("scale=bench"), words)
+    assert spec.plain["consistency"]["scenes_per_count"] == expected
+    old = stored()
+    del old["consistency"]["scenes_per_count"]
+    assert load_spec(old, ["consistency=views"]).plain["consistency"]["scenes_per_count"] == 1
