@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
@@ -25,7 +25,9 @@ ALL = "all"
 class Options:
     """Options of ``rgbt claims``."""
 
-    table: Annotated[str, Help("such as spatialseg/table3; all: every table of the papers")] = ALL
+    table: Annotated[
+        str, Help("such as spatialseg/table3; a,b; all: every table of the papers")
+    ] = ALL
     scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
     form: Annotated[Literal["paper", "released"], Help("form of the rows")] = "paper"
     runs_dir: RunsDir = Path("runs")
@@ -79,7 +81,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from sweeps.verdicts.stored import FinishedRuns, TableResults
     from sweeps.worker.planner import Planner
 
-    names = table_names(Path("none")) if options.table == ALL else [options.table]
+    names = table_names(Path("none"))
+    if options.table != ALL:
+        names = split_list(options.table, "tables")
     finished = FinishedRuns(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
