@@ -15,6 +15,7 @@ import math
 import os
 import platform
 import re
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -54,7 +55,10 @@ def record(runs_dir: Path) -> dict[str, Any]:
 
 
 def training(experiment: str, runs_dir: Path) -> dict[str, Any]:
-    """Logged values by name, and digests of counts, of a run of ten steps."""
+    """Logged values by name, and digests of counts, of a run of ten steps.
+
+    Its folder is removed: all experiments fill 2 GB. Those of upstream runs stay for the next ones.
+    """
     from rgbt.run import main
     from tests.commands import logged
     from tests.composed import specified
@@ -71,6 +75,7 @@ def training(experiment: str, runs_dir: Path) -> dict[str, Any]:
             steps.setdefault(part, []).append(float(line["values"][part]).hex())
     archives = sorted(folder.rglob("*.npz"))
     counts = {path.relative_to(folder).as_posix(): archive_digest(path) for path in archives}
+    shutil.rmtree(folder)
     return {"steps": steps, "counts": counts}
 
 

@@ -132,8 +132,11 @@ class ListSource:
 
     def is_exhausted(self, *, wait: bool) -> bool:
         """See `TrialSource.is_exhausted`."""
-        states = self.states()
-        return "waiting" not in states and not (wait and "running" in states)
+        by_key = trials_by_key(self.store.study)
+        # A killed driver may leave a second trial of a finished point, which is failed when stale.
+        trials = [trial for key in self._same for trial in by_key.get(key, ())]
+        is_running = wait and any(trial.state.name == "RUNNING" for trial in trials)
+        return "waiting" not in self.states() and not is_running
 
     def states(self) -> list[State]:
         """The states of the different points."""

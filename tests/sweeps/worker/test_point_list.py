@@ -106,6 +106,18 @@ def test_untrusted_class_is_refused_before_training(
     assert ("my_lab.Loss" in states["b"].reason) == is_refused
 
 
+def test_waits_for_the_second_trial_of_a_killed_driver(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, points(1))
+    desk.run()
+    assert desk.source.is_exhausted(wait=True)
+    second = desk.store.claim(desk.plans[0].attributes, replaced=[0])
+    assert second == 1, "as if it had been killed before it compared"
+    assert not desk.source.is_exhausted(wait=True)
+    assert desk.source.is_exhausted(wait=False)
+    desk.store.release(second)
+    assert desk.source.is_exhausted(wait=True)
+
+
 def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
     class SameRun(FakePlanner):
         def plan(self, point: Point) -> PlannedPoint:
