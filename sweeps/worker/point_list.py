@@ -133,10 +133,11 @@ class ListSource:
     def is_exhausted(self, *, wait: bool) -> bool:
         """See `TrialSource.is_exhausted`."""
         by_key = trials_by_key(self.store.study)
+        if any(self._status(plan, by_key).state == "waiting" for plan in self._different()):
+            return False
         # A killed driver may leave a second trial of a finished point, which is failed when stale.
         trials = [trial for key in self._same for trial in by_key.get(key, ())]
-        is_running = wait and any(trial.state.name == "RUNNING" for trial in trials)
-        return "waiting" not in self.states() and not is_running
+        return not (wait and any(trial.state.name == "RUNNING" for trial in trials))
 
     def states(self) -> list[State]:
         """The states of the different points."""
