@@ -8,9 +8,12 @@ from __future__ import annotations
 import os
 import random
 import signal
+import sqlite3
 import time
 from collections import Counter
-from multiprocessing import get_context
+from collections.abc import Iterator
+from contextlib import closing
+from multiprocessing import active_children, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,8 @@ from tests.sweeps.fakes import list_desk, points, scored, search_desk, until
 
 pytestmark = pytest.mark.slow
 
+DRIVER = "driver of a test"
+
 
 def drive(runs: Path, kind: str, count: int, looks: int, url: str) -> None:
     """In a process of its own: a driver of `count` points whose runs end after so many looks."""
@@ -39,8 +44,18 @@ def drive(runs: Path, kind: str, count: int, looks: int, url: str) -> None:
         search_desk(runs, run, trials=count, **both).run()
 
 
+@pytest.fixture(autouse=True)
+def end_of_drivers() -> Iterator[None]:
+    """A driver that a failed test has left stopped would never end, nor what it keeps open."""
+    yield
+    for process in active_children():
+        if process.name == DRIVER:
+            process.kill()
+            process.join()
+
+
 def start(*arguments: Any) -> BaseProcess:
-    process = get_context("fork").Process(target=drive, args=arguments)
+    process = get_context("fork").Process(target=drive, args=arguments, name=DRIVER)
     process.start()
     return process
 
@@ -67,6 +82,25 @@ def until_running(runs: Path, url: str) -> None:
         return sum(names.LABEL in trial.user_attrs for trial in trials)
 
     until(lambda: noted() >= 2, "two trials")
+
+
+def stop(process: BaseProcess, database: Path) -> None:
+    """Stop a driver, but not while it locks the SQLite file: no other could write to it."""
+    assert process.pid is not None
+    pid = process.pid
+
+    def is_stopped() -> bool:
+        os.kill(pid, signal.SIGSTOP)
+        os.waitpid(pid, os.WUNTRACED)
+        try:
+            with closing(sqlite3.connect(database, timeout=0.1)) as connection:
+                connection.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError:
+            os.kill(pid, signal.SIGCONT)
+            return False
+        return True
+
+    until(is_stopped, "an instant without a lock")
 
 
 def check(runs: Path, url: str, count: int) -> None:
@@ -116,10 +150,10 @@ def test_driver_stopped_for_longer_than_grace_continues(tmp_path: Path, kind: st
     url = f"sqlite:///{tmp_path / 'studies.db'}"
     first = start(tmp_path, kind, 6, 60, url)
     until_running(tmp_path, url)
-    assert first.pid is not None
-    os.kill(first.pid, signal.SIGSTOP)
+    stop(first, tmp_path / "studies.db")
     assert end(start(tmp_path, kind, 6, 2, url)) == 0
     check(tmp_path, url, 6)
+    assert first.pid is not None
     os.kill(first.pid, signal.SIGCONT)
     assert end(first) == 0
     check(tmp_path, url, 6)
