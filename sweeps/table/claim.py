@@ -47,6 +47,7 @@ class Claim(Strict):
         at_most: largest size, e.g. of a "small improvement".
         effect: letters of the factors of the table's design; the claim is then about that effect
             on the outcomes `columns`, by the methods `rows`.
+        part: of an effect, "trained" or "tested"; default: tested, if the design has that.
         combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
@@ -63,6 +64,7 @@ class Claim(Strict):
     at_least: float = 0.0
     at_most: float | None = None
     effect: str = ""
+    part: str = ""
     combine: Combine = "all"
     remarks: tuple[str, ...] = ()
 

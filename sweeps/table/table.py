@@ -265,6 +265,8 @@ class Table(Strict):
                 for letter in claim.effect:
                     letters = design.letters if design else ()
                     check_choice(f"claim '{claim.name}', effect", letter, letters)
+                if design and claim.part:
+                    check_choice(f"claim '{claim.name}', part", claim.part, design.parts)
                 continue
             named = claim.against if claim.against not in ((OTHERS,), (PREVIOUS,)) else ()
             for label in (*claim.rows, *named):

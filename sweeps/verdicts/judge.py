@@ -261,7 +261,7 @@ class TableJudge:
 
     def judge(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> JudgedClaim:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
-        contrasts = contrasts_of(claim, self.table) or self._effects(claim, runs)
+        contrasts = contrasts_of(claim, self.table) or self._effects(claim)
         printed = [each.of_values(self._printed) for each in contrasts]
         rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
@@ -312,18 +312,14 @@ class TableJudge:
             basis=basis,
         )
 
-    def _effects(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> list[Contrast]:
-        """An effect on each method and outcome, in worlds it is tested in, else trained in."""
+    def _effects(self, claim: Claim) -> list[Contrast]:
+        """An effect on each method and outcome, in worlds that it is tested or trained in."""
         design = self.table.design
         assert design is not None, "a claim about an effect is about a design"
+        part = claim.part or next(iter(design.parts))
+        signs = [sign_of(levels, claim.effect) for levels in design.cells(part)]
         found = []
         for method, outcome in product(claim.rows, claim.columns):
-            labels = {
-                part: [row for row, _ in design.places(part, method)] for part in design.parts
-            }
-            is_run = [all(finished_runs_of(row, runs) for row in each) for each in labels.values()]
-            part = list(labels)[is_run.index(True) if any(is_run) else 0]
-            signs = [sign_of(levels, claim.effect) for levels in design.cells(part)]
             cells = tuple(
                 Cell(2 * sign / len(signs), row, outcome, world)
                 for sign, (row, world) in zip(signs, design.places(part, method), strict=True)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+import sweeps
 from rgbt.checks import InputError
 from sweeps.table.table import Column, Row, Table, load_table
 
@@ -116,6 +117,14 @@ def test_table_that_does_not_fit_is_refused(
         load_table("my/ablation", tmp_path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_claim_about_a_part_that_its_design_lacks_is_refused(tmp_path: Path) -> None:
+    known = Path(sweeps.__file__).parent / "studies" / "spatial_bias.yaml"
+    path = tmp_path / "bias.yaml"
+    path.write_text(known.read_text().replace("part: trained", "part: trainde"))
+    with pytest.raises(InputError, match="part: 'trainde'.*did you mean 'trained'"):
+        load_table(str(path), tmp_path)
 
 
 def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.effects import MEAN, Effects, effects_of
-from sweeps.verdicts.judge import TableJudge
+from sweeps.verdicts.judge import JudgedClaim, TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
@@ -116,6 +116,22 @@ def test_seeds_that_not_all_cells_have_are_left_out() -> None:
     assert found["crm", "baseline", "noise"].seeds == 2
 
 
+def claimed(part: str, runs: Any) -> JudgedClaim:
+    """Noise lowers the contrast, claimed of a part of a design that has both."""
+    claim = Claim(
+        name="worse",
+        says="A sentence.",
+        source="own",
+        rows=("baseline",),
+        columns=("contrast",),
+        effect="N",
+        part=part,
+        expected="lower",
+    )
+    made = replace(design_table(tested=WHOLE), claims=(claim,))
+    return TableJudge("own/t", made, resamples=100).claims(runs)[0]
+
+
 def test_claims_about_effects_are_judged() -> None:
     """Noise makes region 1 worse, and with it the difference of the regions."""
     names = {"worse": ("N", "lower"), "better": ("N", "higher"), "texture": ("T", "higher")}
@@ -139,6 +155,8 @@ def test_claims_about_effects_are_judged() -> None:
     assert worse.verdict is not None
     assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
     assert "N+ - N- (trained)" in worse.contrast
+    assert [claimed(part, trained(3)).word for part in ("", "tested")] == ["not run"] * 2
+    assert claimed("trained", trained(3)).contrast == worse.contrast
     unfinished = {run: each for run, each in trained(3).items() if run[0] != "baseline N+T-"}
     assert judge.claims(unfinished)[0].word == "not run"  # type: ignore[arg-type]
 
