@@ -37,6 +37,7 @@ from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.files.atomic import write_atomic
+from rgbt.files.plain_files import sealed, write_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import details_of
 from rgbt.metrics.pairs import protocol_of
@@ -46,9 +47,8 @@ from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table, warn
 
 SHARED = "shared"
-COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
-# Files of a run folder that are archived: its counts, its texts, and what is kept as it is.
-TEXTS = ("config.yaml", "run.json", "result.json")
+# Files of a run folder that are archived: its counts, and what is kept as it is.
+COUNTS = ("counts_test.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
 ROBUSTNESS = "evaluations/robustness/*/*.json"
 
 # Member with all texts of a run, which repeat most of those of another run in ``shared/``.
@@ -157,20 +157,22 @@ def _undamaged(path: Path) -> Iterator[None]:
 def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
     """The members of ``<key>.zip``; shared arrays are written to `shared`."""
     shared.mkdir(parents=True, exist_ok=True)
-    texts = {path.name: path.read_bytes().decode() for n in TEXTS for path in run.folder.glob(n)}
+    paths = (path for name in ("config.yaml", "result.json") for path in run.folder.glob(name))
+    texts = {path.name: path.read_bytes().decode() for path in paths}
     entries = [
         {name: entry.get(name) for name in PROVENANCE.split()}
         | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}
         for entry in run.provenance
     ]
     texts["provenance.json"] = json.dumps(entries, indent=1)
+    # Its parameters, for MLflow, are the configuration again.
+    texts["run.json"] = json.dumps(sealed(vars(replace(run.description, params={}))))
     members = {PACKED_TEXTS: _packed_texts(json.dumps(texts).encode(), shared)}
     for path in sorted(run.folder.glob(ROBUSTNESS)):
         members[path.relative_to(run.folder).as_posix()] = path.read_bytes()
     for path in counts_of(run.folder):
-        if (counts := Counts.load(path)).split != "val":  # no table reads those
-            name = path.relative_to(run.folder).as_posix()
-            members[f"{name}.xz"] = _packed_counts(counts, shared)
+        name = path.relative_to(run.folder).as_posix()
+        members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
     return members
 
 
@@ -318,8 +320,6 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
     The default of an added setting has to keep the behaviour. Who adds it knows.
     """
     from omegaconf import OmegaConf
-
-    from rgbt.files.plain_files import write_json
 
     for each in [each for each in _compared(options.archive) if each.state == "added"]:
         with tempfile.TemporaryDirectory() as scratch:

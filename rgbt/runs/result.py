@@ -16,7 +16,6 @@ from rgbt.runs.folder import (
     Description,
     counts_name,
     is_finished,
-    lists_of,
     read_description,
     read_provenance,
     read_result,
@@ -86,8 +85,7 @@ class RunResult:
     @property
     def lists(self) -> str:
         """Which lists it was trained and selected on, in words; "" without ``run.json``."""
-        params = self.description.params
-        return lists_of(params) if params else ""
+        return self.tags.get("rgbt.lists", "")
 
     @property
     def machine(self) -> str:

@@ -82,6 +82,8 @@ def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
         assert [getattr(first, each) for each in others] == [getattr(again, e) for e in others]
     assert (unpacked.key, unpacked.commit) == (run.key, "a" * 10)
     assert unpacked.recorded_scores() == run.recorded_scores()
+    assert unpacked.description == replace(run.description, params={})
+    assert unpacked.lists == "trained on train, selected on val"
     assert "cwd" not in unpacked.provenance[0]
 
 
@@ -90,12 +92,13 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
     own = run.folder / "counts_test.npz"
     assert add(run, archive) == add(run, archive)
     first = own.read_bytes()
-    for name in ("counts_a.npz", "counts_b.npz"):  # further counts, of two machines
+    further = ("evaluations/a.npz", "evaluations/b.npz")
+    for name in further:  # of two machines
         (run.folder / name).write_bytes(first)
         assert add(run, archive) == archive / f"{run.key}.zip"
         (run.folder / name).unlink()
     whole = unpack(archive / f"{run.key}.zip", tmp_path / "unpacked").folder
-    assert {"counts_a.npz", "counts_b.npz"} <= {path.name for path in whole.iterdir()}
+    assert all((whole / name).is_file() for name in further)
     some(2, run=run.key).save(run.folder / "counts_test.npz")
     other = add(run, archive)
     assert key_of(other) == run.key
@@ -117,13 +120,16 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
     assert len(list((tmp_path / "results/shared").iterdir())) == before == 5
 
 
-@pytest.mark.parametrize("damage", [0.3, 0.6, "shared", "/tmp/outside.txt", "../outside.txt"])
-def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: float | str) -> None:
+@pytest.mark.parametrize("damage", [0, -1, "shared", "/tmp/outside.txt", "../outside.txt"])
+def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: int | str) -> None:
     path = archived_in(tmp_path)
     shared, other = sorted((tmp_path / "results/shared").iterdir())[:2]
-    if isinstance(damage, float):
+    if isinstance(damage, int):
+        with zipfile.ZipFile(path) as archive:
+            member = archive.infolist()[damage]
         content = bytearray(path.read_bytes())
-        content[int(damage * len(content))] ^= 0xFF
+        # Within the member, which follows a header of 30 bytes and its name.
+        content[member.header_offset + 30 + len(member.filename) + member.compress_size // 2] ^= 255
         path.write_bytes(content)
     elif damage == "shared":  # arrays of other images
         shared.write_bytes(other.read_bytes())
