@@ -16,7 +16,7 @@ from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import PROTOCOLS, file_name
-from rgbt.runs.folder import Description, RunFolder
+from rgbt.runs.folder import Description, RunFolder, lists_of
 from tests.analysis.robust_runs import SCORES, less, write_run
 from tests.analysis.test_results import COMMAS, make_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
@@ -226,8 +226,9 @@ def test_arguments_that_make_no_sense_are_refused(
 def test_different_lists_are_said(call: Call, tmp_path: Path) -> None:
     for (key, split), counts in zip((("aaa0", "train"), ("bbb0", "all")), pair(), strict=True):
         folder = make_run(tmp_path / "runs", key, key, 0)
-        params = {"domains.source.split": split}
-        RunFolder(folder).describe(Description(key, {"rgbt.group": key, "rgbt.seed": "0"}, params))
+        lists = lists_of({"domains.source.split": split})
+        tags = {"rgbt.group": key, "rgbt.seed": "0", "rgbt.lists": lists}
+        RunFolder(folder).describe(Description(key, tags, {}))
         counts.save(folder / "counts_test.npz")
     words = ("a=aaa0", "b=bbb0", f"runs_dir={tmp_path / 'runs'}", *FAST)
     code, out, err = call(entry, *words)
