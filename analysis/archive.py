@@ -171,8 +171,8 @@ def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
     for path in sorted(run.folder.glob(ROBUSTNESS)):
         members[path.relative_to(run.folder).as_posix()] = path.read_bytes()
     for path in counts_of(run.folder):
-        name = path.relative_to(run.folder).as_posix()
-        members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
+        if (found := Counts.load(path)).split != "val":  # no table reads those
+            members[f"{path.relative_to(run.folder).as_posix()}.xz"] = _packed_counts(found, shared)
     return members
 
 

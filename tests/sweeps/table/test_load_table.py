@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-import sweeps
 from rgbt.checks import InputError
-from sweeps.table.table import Column, Row, Table, load_table
+from sweeps.table.table import STUDIES, Column, Row, Table, load_table
 
 SMALL: dict[str, Any] = {
     "paper": "my",
@@ -120,9 +119,9 @@ def test_table_that_does_not_fit_is_refused(
 
 
 def test_claim_about_a_part_that_its_design_lacks_is_refused(tmp_path: Path) -> None:
-    known = Path(sweeps.__file__).parent / "studies" / "spatial_bias.yaml"
     path = tmp_path / "bias.yaml"
-    path.write_text(known.read_text().replace("part: trained", "part: trainde"))
+    known = (STUDIES / "spatial_bias.yaml").read_text()
+    path.write_text(known.replace("part: trained", "part: trainde"))
     with pytest.raises(InputError, match="part: 'trainde'.*did you mean 'trained'"):
         load_table(str(path), tmp_path)
 

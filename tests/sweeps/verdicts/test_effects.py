@@ -13,7 +13,7 @@ from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.effects import MEAN, Effects, effects_of
-from sweeps.verdicts.judge import JudgedClaim, TableJudge
+from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
@@ -116,37 +116,22 @@ def test_seeds_that_not_all_cells_have_are_left_out() -> None:
     assert found["crm", "baseline", "noise"].seeds == 2
 
 
-def claimed(part: str, runs: Any) -> JudgedClaim:
-    """Noise lowers the contrast, claimed of a part of a design that has both."""
-    claim = Claim(
-        name="worse",
+def claim(letter: str, expected: Any, part: str = "") -> Claim:
+    return Claim(
+        name="of an effect",
         says="A sentence.",
         source="own",
         rows=("baseline",),
         columns=("contrast",),
-        effect="N",
+        effect=letter,
         part=part,
-        expected="lower",
+        expected=expected,
     )
-    made = replace(design_table(tested=WHOLE), claims=(claim,))
-    return TableJudge("own/t", made, resamples=100).claims(runs)[0]
 
 
 def test_claims_about_effects_are_judged() -> None:
     """Noise makes region 1 worse, and with it the difference of the regions."""
-    names = {"worse": ("N", "lower"), "better": ("N", "higher"), "texture": ("T", "higher")}
-    claims = tuple(
-        Claim(
-            name=name,
-            says="A sentence.",
-            source="own",
-            rows=("baseline",),
-            columns=("contrast",),
-            effect=letter,
-            expected=expected,  # type: ignore[arg-type]
-        )
-        for name, (letter, expected) in names.items()
-    )
+    claims = (claim("N", "lower"), claim("N", "higher"), claim("T", "higher"))
     made = replace(design_table(), claims=claims)
     judge = TableJudge("own/t", made, resamples=100)
     worse, better, texture = judge.claims(trained(3))  # type: ignore[arg-type]
@@ -155,10 +140,16 @@ def test_claims_about_effects_are_judged() -> None:
     assert worse.verdict is not None
     assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
     assert "N+ - N- (trained)" in worse.contrast
-    assert [claimed(part, trained(3)).word for part in ("", "tested")] == ["not run"] * 2
-    assert claimed("trained", trained(3)).contrast == worse.contrast
     unfinished = {run: each for run, each in trained(3).items() if run[0] != "baseline N+T-"}
     assert judge.claims(unfinished)[0].word == "not run"  # type: ignore[arg-type]
+
+
+def test_claim_is_about_one_part_of_a_design() -> None:
+    claims = tuple(claim("N", "lower", part) for part in ("", "tested", "trained"))
+    judge = TableJudge("own/t", replace(design_table(tested=WHOLE), claims=claims), resamples=100)
+    judged = judge.claims(trained(3))  # type: ignore[arg-type]
+    assert [each.word for each in judged] == ["not run", "not run", "holds"]
+    assert "N+ - N- (trained)" in judged[-1].contrast
 
 
 def test_networks_tested_in_worlds_use_counts_of_each() -> None:
