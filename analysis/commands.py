@@ -17,6 +17,7 @@ from rich.progress import Progress
 from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.options import Help
+from rgbt.cores import usable_cores
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.metric import MAX_REGIONS, Absent
 from rgbt.tables import ABSENT, TextTable, csv_text, number
@@ -105,7 +106,7 @@ def in_threads(work: Callable[..., T], *items: Iterable[Any], threads: int) -> I
 
     The first error cancels items that have not started.
     """
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads or usable_cores()) as pool:
         try:
             yield from pool.map(work, *items)
         except BaseException:

@@ -17,7 +17,9 @@ FILES = [
     if "conf" not in path.parts
 ]
 
-ALONE = {"types", "checks", "ranges", "randomness", "processes", "class_scores", "averaging"}
+ALONE = {
+    *("types", "checks", "ranges", "randomness", "processes", "cores", "class_scores", "averaging")
+}
 BASE = ALONE | {"dataset", "requirements", "files", "terminal", "tables"}
 SHARED = BASE | {"geometry"}
 COMPONENTS = {

@@ -7,7 +7,6 @@ Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: probl
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from rich.progress import track
 from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
+from rgbt.cores import usable_cores
 from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.labels import PixelCounts, label_pixels
 from rgbt.tables import TextTable
@@ -65,7 +65,7 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
             f"dataset: {type(dataset).__name__} cannot be checked, because it is not a "
             "rgbt.data.file_dataset.FileDataset."
         )
-    report = check_dataset(dataset, num_threads=os.cpu_count() or 1, is_shown=True)
+    report = check_dataset(dataset, num_threads=usable_cores(), is_shown=True)
     print_rich(plain_text(f"{dataset.name} ({type(dataset).__name__}): {dataset.root}"))
     for table in tables(dataset, report):
         print_rich(rich_table(table))

@@ -1,6 +1,13 @@
-"""The progress bar of a command: what was done, speed and remaining time in one line."""
+"""The progress bar of a command: what was done, speed and remaining time in one line.
+
+A training that becomes much slower says so.
+"""
 
 from __future__ import annotations
+
+import os
+from collections import deque
+from statistics import fmean, median
 
 from rich.console import Console
 from rich.progress import (
@@ -12,6 +19,12 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from rgbt.cores import usable_cores
+from rgbt.terminal import warn
+
+# A training is slow when its last steps take so many times as long as its first ones.
+SLOWER, NUM_FIRST, NUM_LAST = 10, 100, 10
 
 # Progress goes to stderr; stdout is for results.
 CONSOLE = Console(stderr=True)
@@ -33,3 +46,32 @@ def progress() -> Progress:
         refresh_per_second=4,
         auto_refresh=CONSOLE.is_terminal,
     )
+
+
+class Pace:
+    """The time of the steps of a training; warns once where they become much slower.
+
+    Medians are compared, so that one slow step is no reason.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._threads, self._has_warned = threads, False
+        self._first: list[float] = []
+        self._last: deque[tuple[float, float]] = deque(maxlen=NUM_LAST)
+
+    def add(self, seconds: float, waited: float) -> None:
+        """Note a step: its time, and the part of it in which it waited for its images."""
+        if len(self._first) < NUM_FIRST:
+            self._first.append(seconds)
+        self._last.append((seconds, waited))
+        usual, now = median(self._first), median(seconds for seconds, _ in self._last)
+        if self._has_warned or len(self._first) < 2 * NUM_LAST or now < SLOWER * usual:
+            return
+        self._has_warned = True
+        share = fmean(waited / seconds for seconds, waited in self._last)
+        warn(
+            f"a step takes {now:.3g} s now, {now / usual:.0f} times as long as before "
+            f"({share:.0%} of it waiting for images). The load of this machine is "
+            f"{os.getloadavg()[0]:.1f} on {usable_cores()} cores, and trainer.threads="
+            f"{self._threads}: see whether other programs need its cores, or its disk."
+        )

@@ -27,7 +27,7 @@ from rgbt.engine.checkpoint import (
     training_payload,
 )
 from rgbt.engine.optimizers import step_without_gradient
-from rgbt.engine.progress import progress
+from rgbt.engine.progress import Pace, progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import agreed, collected, largest, mean_count, num_processes, rank
@@ -94,6 +94,7 @@ class Trainer:
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
         self.weights = EvaluatedWeights(self.model, self.settings)
+        self.pace = Pace(self.settings.threads)
 
     def resume(self, state: State) -> bool:
         """Restore everything from the last checkpoint into `state`; False if there is none.
@@ -235,6 +236,8 @@ class Trainer:
         except RunError as error:
             raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
         elapsed = time.perf_counter() - started
+        if rank() == 0:
+            self.pace.add(elapsed, waited)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         if device.type == "cuda":
             peak = torch.cuda.max_memory_allocated(device) / 2**20

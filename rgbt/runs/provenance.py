@@ -21,6 +21,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rgbt.cores import usable_cores
 from rgbt.runs.folder import read_provenance
 from rgbt.terminal import info, warn
 
@@ -145,7 +146,7 @@ def machine() -> dict[str, Any]:
         "platform": platform.platform(),
         "cpu": model[1].strip() if model else platform.processor() or platform.machine(),
         "cpu_count": os.cpu_count(),
-        "cpu_usable": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "cpu_usable": usable_cores(),
         "memory_gib": round(memory / 2**30, 1),
         "gpus": [torch.cuda.get_device_name(index) for index in gpus],
         "cuda": torch.version.cuda,

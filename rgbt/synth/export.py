@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from rgbt.checks import InputError
+from rgbt.cores import usable_cores
 from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.light import is_night
 from rgbt.synth.scene import Scene, render_pair, render_scene
@@ -157,7 +158,7 @@ def _write(images: Images, folder: Path) -> None:
 
 
 def _for_each(work: partial[None], shots: Sequence[Shot]) -> Iterator[None]:
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    cores = usable_cores()
     if len(shots) < _WORTH_A_POOL or cores == 1:
         cv2.setNumThreads(1)
         yield from map(work, shots)

@@ -19,6 +19,7 @@ import torch
 from torch import distributed
 
 from rgbt.checks import InputError, RunError
+from rgbt.cores import sleep_while_waiting
 from rgbt.data.loaders import check_batch_size
 from rgbt.engine.batch_norm import check_batch_norm_parts
 from rgbt.engine.fabric import open_fabric
@@ -110,8 +111,8 @@ def launch(num_processes: int, words: Sequence[str]) -> int:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.run import get_args_parser, main
 
-    # Threads of one process that wait in a loop would take the cores of the others.
-    preferred = {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}
+    sleep_while_waiting()
+    preferred = {"OMP_NUM_THREADS": "1"}
     if any(name == "lo" for _, name in socket.if_nameindex()):
         # Otherwise gloo looks up the name of this machine, which containers may not know.
         preferred["GLOO_SOCKET_IFNAME"] = "lo"

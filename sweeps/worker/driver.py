@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rgbt.checks import RunError
+from rgbt.cores import usable_cores
 from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
@@ -63,6 +64,7 @@ class Driver:
     _began: float = field(default_factory=time.monotonic)
     _last_claim: float = -math.inf
     _last_heartbeat: float = field(default_factory=time.monotonic)
+    _has_reported_cores: bool = False
 
     def __post_init__(self) -> None:
         self.store = self.source.store
@@ -139,8 +141,26 @@ class Driver:
         # A point that was finished elsewhere needs no process: its slot is free at once.
         if self._advance(trial):
             del self.running[slot]
+        self._report_cores()
         self._send_heartbeats()
         return True
+
+    def _report_cores(self) -> None:
+        """Say once that the trials compute with more threads than this machine has cores."""
+        trainers = [trial.plan.runs[0].trainer for trial in self.running.values()]
+        cores, threads = usable_cores(), sum(each.threads for each in trainers)
+        if self._has_reported_cores or len(trainers) == 1 or threads <= cores:
+            return
+        self._has_reported_cores = True
+        import torch
+
+        if not torch.accelerator.is_available() or trainers[0].accelerator == "cpu":
+            fitting = max(1, cores * len(trainers) // threads)
+            self.view.say(
+                "note",
+                f"{len(trainers)} runs with trainer.threads={trainers[0].threads} share {cores} "
+                f"cores: more than workers={fitting} gain little.",
+            )
 
     def _is_over(self) -> bool:
         """Whether the time of this call is spent."""

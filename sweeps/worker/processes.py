@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rgbt.checks import InputError
+from rgbt.cores import sleep_while_waiting
 from rgbt.runs.source_code import counted_modules
 
 CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.worker.preload"
@@ -31,9 +32,7 @@ class LocalExecutor:
 
     def __init__(self, workers: int = 1) -> None:
         if workers > 1:
-            # Threads of one run that wait in a loop would take the cores of the others (2.3 times
-            # slower). A run alone is faster with them (1.15 to 1.5).
-            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+            sleep_while_waiting()
         self._context = multiprocessing.get_context("forkserver")
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> LocalJob:

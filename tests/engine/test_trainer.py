@@ -136,6 +136,16 @@ def test_losses_and_values_beside_them_are_logged(tmp_path: Path) -> None:
     assert first["loss"] == first["loss/fit"]
 
 
+def test_every_step_is_timed_with_its_wait_for_images(tmp_path: Path) -> None:
+    trainer, log = make(tmp_path)
+    timed: list[tuple[float, float]] = []
+    trainer.pace.add = lambda *step: timed.append(step)  # type: ignore[method-assign, assignment]
+    trainer.fit(batches(0), State(seed=0))
+    for (seconds, waited), (_, values) in zip(timed, log, strict=True):
+        assert seconds == pytest.approx(4 / values["images_per_s"])
+        assert waited / seconds == pytest.approx(values["wait_share"])
+
+
 def test_value_not_finite_is_named_and_stops_the_run(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path, poison=3)
     with pytest.raises(RunError, match=r"step 4: fit is nan"):

@@ -68,7 +68,7 @@ def plan_of(point: Point, steps: int = 4) -> PlannedPoint:
             key=key_of(words),
             overrides=words,
             plain={},
-            trainer=SimpleNamespace(max_steps=steps),
+            trainer=SimpleNamespace(max_steps=steps, threads=2, accelerator="cpu"),
             scale=SimpleNamespace(pixel_factor=1.0),
         )
         for words in point.runs()

@@ -122,6 +122,19 @@ def test_driver_gives_processes_tags_gpu_and_trust(tmp_path: Path) -> None:
     assert json.loads(environments[0][TAGS])["rgbt.table/one"] == "row"
 
 
+@pytest.mark.parametrize(("cores", "said"), [(6, []), (5, [2]), (3, [1])])
+def test_driver_more_threads_than_cores_are_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int, said: list[int]
+) -> None:
+    monkeypatch.setattr(drivers, "usable_cores", lambda: cores)
+    desk = list_desk(tmp_path, points(6), scored(0.5), workers=3).run()
+    notes = [text for how, text in desk.view.said if how == "note"]
+    assert [f"more than workers={number} gain" in text for number, text in zip(said, notes)] == [
+        True
+    ] * len(said)
+    assert len(notes) == len(said)
+
+
 def test_driver_sends_heartbeats_of_running_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
