@@ -26,6 +26,7 @@ from rgbt.randomness import numpy_generator
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import WORDS
 from tests.commands import SPLITS, Call, Trained, without_pictures, words_of
+from tests.forked_python import Server
 
 WriteMFNet = Callable[..., Path]
 
@@ -173,6 +174,12 @@ def composed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planner, "specify_run", specify)
         yield
+
+
+@pytest.fixture(scope="session")
+def forks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables of `tests.forked_python.PYTHON`, whose programs start without importing."""
+    return Server(tmp_path_factory.mktemp("forks")).environment
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import COMMANDS
 from tests.docs.pages import ROOT, Block, Page, difference, filled, pages, problems_of, write
 from tests.docs.small import ENOUGH, SMOKE
+from tests.forked_python import PYTHON
 
 pytestmark = pytest.mark.docs
 
@@ -73,19 +74,22 @@ def _composes(words: list[str]) -> None:
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(forks: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one finished run, for pages that begin with one."""
     runs = tmp_path_factory.mktemp("finished") / "runs"
     words = ["+experiment=grbm", f"runs_dir={runs}", "tracking=none", *SMOKE, ENOUGH]
-    subprocess.run([sys.executable, "-m", "rgbt.run", *words], check=True, capture_output=True)
+    command = [*PYTHON.split(), "-m", "rgbt.run", *words]
+    subprocess.run(command, check=True, capture_output=True, env=os.environ | forks)
     return runs
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in pages() if runnable(p)], ids=lambda page: page.name)
-def test_page_can_be_followed(page: Page, tmp_path: Path, finished: Path) -> None:
+def test_page_can_be_followed(
+    page: Page, tmp_path: Path, finished: Path, forks: dict[str, str]
+) -> None:
     """Every block in order: bash in one shell after the other, Python in one process."""
-    reader = Reader(page, tmp_path / "reader", finished)
+    reader = Reader(page, tmp_path / "reader", finished, forks)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(reader.folder)
         patch.setenv("MPLBACKEND", "agg")
@@ -99,14 +103,14 @@ def test_page_can_be_followed(page: Page, tmp_path: Path, finished: Path) -> Non
 class Reader:
     """Follows one page in an empty folder."""
 
-    def __init__(self, page: Page, folder: Path, finished: Path) -> None:
+    def __init__(self, page: Page, folder: Path, finished: Path, forks: dict[str, str]) -> None:
         self.folder, self.state = folder, folder.parent / "state"
         tools = folder.parent / "bin"
         for each in (folder, tools):
             each.mkdir()
         newest = f"[ -d runs ] || cp -r {finished} runs; ls -td runs/*/result.json | head -1"
         scripts = {
-            "rgbt": f'exec {sys.executable} -m tests.docs.small "$@"',
+            "rgbt": f'exec {PYTHON} -m tests.docs.small "$@"',
             "newest": f'dirname "$({newest})"',
         }
         for name, text in scripts.items():
@@ -114,6 +118,7 @@ class Reader:
             (tools / name).chmod(0o755)
         self.environment = {
             **os.environ,
+            **forks,
             "PATH": os.pathsep.join(
                 [str(tools), str(Path(sys.executable).parent), os.environ["PATH"]]
             ),
@@ -220,6 +225,6 @@ def test_reader_stops_at_a_mistake(tmp_path: Path) -> None:
         "```text\n3\n```\n"
     )
     page = Page.read(path)
-    reader = Reader(page, tmp_path / "reader", tmp_path)
+    reader = Reader(page, tmp_path / "reader", tmp_path, {})
     found = [reader.follow(block) for block in page.blocks]
     assert [bool(each) for each in found] == [False, False, True, False, True, False]
