@@ -60,12 +60,18 @@ def training(experiment: str, runs_dir: Path) -> dict[str, Any]:
     Its folder is removed: all experiments fill 2 GB. Those of upstream runs stay for the next ones.
     """
     from rgbt.run import main
-    from tests.commands import logged
+    from tests.commands import logged, without_pictures
     from tests.composed import specified
 
     words = [f"+experiment={experiment}", *TEN_STEPS, f"runs_dir={runs_dir}"]
-    said, command = io.StringIO(), patch("sys.argv", ["rgbt", *words])
-    with command, redirect_stderr(said), redirect_stdout(said), pytest.raises(SystemExit) as left:
+    said = io.StringIO()
+    with (
+        patch("sys.argv", ["rgbt", *words]),
+        redirect_stderr(said),
+        redirect_stdout(said),
+        without_pictures(),
+        pytest.raises(SystemExit) as left,
+    ):
         main()
     assert not left.value.code, said.getvalue()
     folder = specified(tuple(words)).folder

@@ -15,13 +15,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from rgbt.config import compose
+from rgbt.files.atomic import write_atomic
 from rgbt.randomness import numpy_generator
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import WORDS
@@ -54,11 +56,41 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True)
 def modules_of_the_reader() -> Iterator[None]:
     """Forget the reader's modules `my_lab`: every test has its own."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
-        del sys.modules[name]
+    forget_reader()
     yield
-    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
-        del sys.modules[name]
+    forget_reader()
+
+
+def forget_reader() -> None:
+    if "my_lab" in sys.modules:  # few tests have it, and there are thousands of modules
+        for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+            del sys.modules[name]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composed_by_any_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The processes of the suite share what Hydra has composed, a quarter of their time."""
+    shared = shared_folder(tmp_path_factory) / "composed"
+    shared.mkdir(exist_ok=True)
+    alone = compose._by_hydra.__wrapped__
+
+    def by_hydra(words: tuple[str, ...], own: str) -> bytes:
+        if own:  # files of one test
+            return alone(words, own)
+        path = shared / hashlib.sha256(repr(words).encode()).hexdigest()
+        if not path.exists():
+            write_atomic(path, alone(words, own))
+        return path.read_bytes()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compose, "_by_hydra", lru_cache(256)(by_hydra))
+        yield
+
+
+def shared_folder(factory: pytest.TempPathFactory) -> Path:
+    """A folder of this call of pytest, whose processes share it."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -192,8 +224,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     from rgbt.run import main
     from tests.composed import specified
 
-    base = tmp_path_factory.getbasetemp()
-    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
+    shared = shared_folder(tmp_path_factory) / "trained"
 
     def run(*overrides: str) -> Path:
         names_data = any(word.startswith("dataset=") for word in overrides)

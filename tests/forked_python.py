@@ -22,7 +22,7 @@ def ask(words: list[str]) -> int:
     """Run a program in a fork of the server; its exit code, 70 if it was killed."""
     with socket.socket(socket.AF_UNIX) as server:
         server.connect(os.environ[SOCKET])
-        request = json.dumps([words, os.getcwd(), dict(os.environ)]).encode()
+        request = json.dumps([words, str(Path.cwd()), dict(os.environ)]).encode()
         socket.send_fds(server, [len(request).to_bytes(4, "big")], [0, 1, 2])
         server.sendall(request)
         return (server.recv(1) or b"\x46")[0]

@@ -327,6 +327,7 @@ def only_road(counts: np.ndarray) -> bool:
     return not counts[..., 1:].any()
 
 
+@pytest.mark.slow
 def test_night_images_are_predicted_by_the_targets_head(
     trained: Trained, call: Call, tmp_path: Path
 ) -> None:

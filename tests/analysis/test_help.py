@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.analysis.test_compare import FAST, pair, saved
 
 HEAVY = ("torch", "matplotlib", "mlflow", "pandas", "scipy", "PIL", "cv2")
@@ -32,6 +34,7 @@ print("torch" in sys.modules)
 """
 
 
+@pytest.mark.slow
 def test_commands_wait_for_no_heavy_library(tmp_path: Path) -> None:
     words = [*saved(tmp_path, *pair()), *FAST]
     script = f"words_of = {words}\n{SCRIPT}"

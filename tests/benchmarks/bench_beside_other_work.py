@@ -13,6 +13,7 @@ Each word is a set of environment variables to measure; without words, those in 
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import statistics
@@ -20,13 +21,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 STEPS, SKIPPED, BATCH = 24, 4, 4
-LIMIT_S = 400.0
-"""Longest time of a command; it is ended then, and the table has a lower bound."""
+LIMIT_S = 90.0
+"""Longest time of a command; it is ended then, and the table has "inf"."""
 
 RUN = (
     *("run", "+experiment=grbm", "tracking=none", "trainer.log_every=1"),
@@ -85,18 +86,20 @@ def wall(commands: Sequence[Sequence[str]], setting: Environment) -> float:
                 raise RuntimeError(f"rgbt {' '.join(words)} ended with exit code {each.returncode}")
         except subprocess.TimeoutExpired:
             for late in started:
-                os.killpg(late.pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):  # it has ended
+                    os.killpg(late.pid, signal.SIGKILL)
                 late.wait()
-            return float("inf")
+            return math.inf
     return time.monotonic() - began
 
 
 def step_seconds(runs: Path) -> float:
-    """Median of the steps of the one run in a folder, without the first ones."""
+    """Median of the steps of the one run in a folder, without the first ones; inf without more."""
     (log,) = runs.glob("*/metrics.jsonl")
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     speeds = [line["values"]["images_per_s"] for line in lines if line["kind"] == "train"]
-    return BATCH / statistics.median(speeds[SKIPPED:])
+    later = speeds[SKIPPED:]
+    return BATCH / statistics.median(later) if later else math.inf
 
 
 def measure(folder: Path, setting: Environment, number: int, trained: Path) -> dict[str, float]:

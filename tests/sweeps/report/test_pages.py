@@ -113,6 +113,7 @@ def test_own_table_shows_values_verdicts_and_their_basis(report: Report) -> None
     assert "rgbt reproduce table=my/planted seeds=3\n" in text
 
 
+@pytest.mark.slow
 def test_rows_of_a_missing_checkout_are_found_by_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,7 +25,7 @@ from tests.composed import specified
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 FORMS: tuple[Form, ...] = get_args(Form)
 SLOW = pytest.mark.slow
-SCALES = ["demo", *(pytest.param(scale, marks=SLOW) for scale in ("bench", "paper"))]
+MANY_ROWS = {"multihead/table3", "multihead/table4"}
 
 SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
 """Losses of the second view by the setting of the loss of Temporal."""
@@ -252,8 +252,14 @@ class Composed(Planner):
             return specified((*others, *scaled, *rooted))
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", [*TABLES, *study_names()])
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [
+        pytest.param(name, scale, marks=[SLOW] if scale != "demo" or name in MANY_ROWS else [])
+        for name in (*TABLES, *study_names())
+        for scale in ("demo", "bench", "paper")
+    ],
+)
 def test_rows_of_a_table(name: str, scale: str) -> None:
     """Each row is composed once: a third of the time of most tests."""
     # What a command checks of the tables of a user alone.
@@ -344,7 +350,7 @@ TWICE = (
 MAIN = ("mIoU", "rgbt_mIoU", "mIoU_day", "mIoU_rgb")
 
 
-@pytest.mark.parametrize("scale", SCALES[::2])
+@pytest.mark.parametrize("scale", ["demo", pytest.param("paper", marks=SLOW)])
 def test_rows_printed_twice_are_one_run(scale: str) -> None:
     for cells in TWICE:
         keys, printed = set(), set()
