@@ -3,8 +3,9 @@
 A thread of OpenMP that has done its part of an operation waits for the others, first in a loop and
 then asleep. The loop is faster while each thread has a core, and slower where another program uses
 one: the loop then takes the core of the thread that it waits for. `rgbt.WAITING` lets threads loop
-for about 0.1 ms, in place of 6 to 20 ms (GNU) or 200 ms (Intel, LLVM): a run alone is as fast, and
-at most three times slower beside others. `tests.benchmarks.bench_beside_other_work` measures it.
+for a fraction of a millisecond, in place of several (GNU) or of 200 (Intel, LLVM): a run alone is
+about as fast, and two to three times slower beside another program, in place of 25 times
+(`tests.benchmarks.bench_beside_other_work`).
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def start(words: Sequence[str], setting: Environment) -> subprocess.Popen[bytes]
 
 
 def wall(commands: Sequence[Sequence[str]], setting: Environment) -> float:
-    """Seconds until all of these commands, begun at once, have ended; inf where they take too long.
+    """Seconds until these commands, started at once, have all ended; inf where they take too long.
 
     Raises:
         RuntimeError: a command failed.

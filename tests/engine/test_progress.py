@@ -10,7 +10,7 @@ from rgbt.engine.progress import Pace
 
 
 def warned(pace: Pace, capsys: pytest.CaptureFixture[str], *steps: float) -> list[str]:
-    """What is said after each of these steps, of which a quarter is waiting."""
+    """The output after each of these steps, a quarter of which is waiting."""
     said = []
     for seconds in steps:
         pace.add(seconds, seconds / 4)
