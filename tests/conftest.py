@@ -27,8 +27,8 @@ from rgbt.files.atomic import write_atomic
 from rgbt.randomness import numpy_generator
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import WORDS
+from tests import forked_python
 from tests.commands import SPLITS, Call, Trained, without_pictures, words_of
-from tests.forked_python import Server
 
 WriteMFNet = Callable[..., Path]
 
@@ -209,9 +209,10 @@ def composed_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def forks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Variables of `tests.forked_python.PYTHON`, whose programs start without importing."""
-    return Server(tmp_path_factory.mktemp("forks")).environment
+    with forked_python.server(tmp_path_factory.mktemp("forks")) as variables:
+        yield variables
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,8 @@ import json
 import os
 import socket
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 SOCKET = "RGBT_TESTS_FORKED"
@@ -116,22 +118,22 @@ def run(words: list[str]) -> None:
         exec(compile(what, "<string>", "exec"), {"__name__": "__main__"})
 
 
-class Server:
-    """A server, which ends with this process; `environment` leads a client to it."""
+@contextmanager
+def server(folder: Path) -> Iterator[dict[str, str]]:
+    """A server with its socket in `folder`; the variables that lead a client to it."""
+    import subprocess
 
-    def __init__(self, folder: Path) -> None:
-        import subprocess
-
-        path = str(folder / "socket")
-        self.environment = {SOCKET: path}
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.forked_python", "serve", path],
-            cwd=Path(__file__).parents[1],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline() == b"ready\n"
+    path = str(folder / "socket")
+    command = [sys.executable, "-m", "tests.forked_python", "serve", path]
+    pipe, root = subprocess.PIPE, Path(__file__).parents[1]
+    with subprocess.Popen(command, cwd=root, stdin=pipe, stdout=pipe) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        try:
+            yield {SOCKET: path}
+        finally:
+            process.stdin.close()
 
 
 PYTHON = f"{sys.executable} -S -E {__file__}"
