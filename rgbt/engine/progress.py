@@ -61,11 +61,13 @@ class Pace:
 
     def add(self, seconds: float, waited: float) -> None:
         """Note a step: its time, and the part of it in which it waited for its images."""
+        if self._has_warned:
+            return
         if len(self._first) < NUM_FIRST:
             self._first.append(seconds)
         self._last.append((seconds, waited))
         usual, now = median(self._first), median(seconds for seconds, _ in self._last)
-        if self._has_warned or len(self._first) < 2 * NUM_LAST or now < SLOWER * usual:
+        if len(self._first) < 2 * NUM_LAST or now < SLOWER * usual:
             return
         self._has_warned = True
         share = fmean(waited / seconds for seconds, waited in self._last)

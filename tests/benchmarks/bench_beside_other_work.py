@@ -85,12 +85,17 @@ def wall(commands: Sequence[Sequence[str]], setting: Environment) -> float:
             if each.wait(LIMIT_S):
                 raise RuntimeError(f"rgbt {' '.join(words)} ended with exit code {each.returncode}")
         except subprocess.TimeoutExpired:
-            for late in started:
-                with suppress(ProcessLookupError):  # it has ended
-                    os.killpg(late.pid, signal.SIGKILL)
-                late.wait()
+            kill(started)
             return math.inf
     return time.monotonic() - began
+
+
+def kill(started: Sequence[subprocess.Popen[bytes]]) -> None:
+    """End commands with the processes that they have started."""
+    for each in started:
+        with suppress(ProcessLookupError):  # it has ended
+            os.killpg(each.pid, signal.SIGKILL)
+        each.wait()
 
 
 def step_seconds(runs: Path) -> float:

@@ -26,6 +26,7 @@ TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 FORMS: tuple[Form, ...] = get_args(Form)
 SLOW = pytest.mark.slow
 MANY_ROWS = {"multihead/table3", "multihead/table4"}
+"""Tables whose rows take several seconds to compose."""
 
 SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
 """Losses of the second view by the setting of the loss of Temporal."""
