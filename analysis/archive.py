@@ -9,7 +9,8 @@ predictions only: the right ones are what is left of the labelled pixels. Unpack
 folder that `rgbt.runs.result.RunResult` reads; its counts are equal, bit for bit. No file depends
 on another run, so two machines that add runs never conflict.
 
-Exit code 1 of ``check``: a run is damaged, or its command now has another key.
+Exit code 1 of ``check``: a run is damaged, its scores are not those of its counts, or its command
+now has another key. No stored word is composed (`rgbt.runs.specify.request_again`).
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from analysis.commands import Archive
 from rgbt.checks import InputError, one_line
@@ -45,6 +48,9 @@ from rgbt.runs.folder import find_run, is_finished, read_result, runs_in
 from rgbt.runs.result import RunResult
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table, warn
+
+if TYPE_CHECKING:
+    from rgbt.runs.run_spec import RunSpec
 
 SHARED = "shared"
 # Files of a run folder that are archived: its counts, and what is kept as it is.
@@ -90,7 +96,7 @@ def unpack(path: Path, folder: Path | None = None) -> RunResult:
         with _undamaged(path):
             _write_members(path, unpacked)
         result = RunResult(unpacked).result
-        if result.get("key", key) != key:
+        if result["key"] != key:
             raise InputError(f"{path} holds the run {result['key']}; rename the file.")
         target.parent.mkdir(exist_ok=True)
         try:
@@ -125,10 +131,12 @@ def add(run: RunResult, folder: Path) -> Path:
 
     Further counts of the same results are added to the file. Other results of the same key, from
     another machine, are kept beside as ``<key>-<digest>.zip``.
-    InputError: the run is not finished, or one of its files is damaged.
+    InputError: the run is not finished, one of its files is damaged, or its scores are not those of
+    its counts.
     """
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
+    run.check()
     members = _packed(run, folder / SHARED)
     path = folder / f"{run.key}.zip"
     with _undamaged(path):
@@ -150,6 +158,8 @@ def _members(path: Path) -> dict[str, bytes]:
 def _undamaged(path: Path) -> Iterator[None]:
     try:
         yield
+    except InputError:
+        raise
     except Exception as error:  # of any kind, by what is damaged
         raise InputError(f"{path} is damaged ({one_line(error)}).") from error
 
@@ -305,12 +315,13 @@ def add_runs(options: AddOptions, _: list[str]) -> int:
 
 
 def check(options: ArchiveOptions, _: list[str]) -> int:
-    """Compose the command of every archived run again, and report whose key has changed."""
+    """Compare every archived run with its counts, and its key with that of its command today."""
     found = list(_compared(options.archive))
-    rows = [(each.path.stem, each.state, each.reason) for each in found if each.state != "same"]
+    rows = [(path.stem, state, reason) for path, state, reason, _ in found if state != "same"]
     if rows:
         print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
-    print_rich(f"{len(found)} runs, {len(found) - len(rows)} have the key of their command.")
+    good = len(found) - len(rows)
+    print_rich(f"{len(found)} runs, {good} have the scores of their counts and today's key.")
     return int(bool(rows))
 
 
@@ -321,69 +332,55 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
     """
     from omegaconf import OmegaConf
 
-    for each in [each for each in _compared(options.archive) if each.state == "added"]:
+    for path, state, _, spec in list(_compared(options.archive)):
+        if state != "added" or spec is None:
+            continue
         with tempfile.TemporaryDirectory() as scratch:
-            folder = unpack(each.path, Path(scratch)).folder
-            settings = OmegaConf.to_yaml(OmegaConf.create(dict(each.settings)))
-            (folder / "config.yaml").write_text(settings)
-            write_json(folder / "result.json", {**(read_result(folder) or {}), "key": each.key})
-            for path in counts_of(folder):
-                counts = Counts.load(path)
-                replace(counts, run=each.key if counts.run else "").save(path)
-            new = folder.rename(folder.with_name(each.key))
-            path = add(RunResult(new), options.archive)
-        each.path.unlink()
-        print_rich(plain_text(f"{each.path}  ->  {path}"))
+            folder = unpack(path, Path(scratch)).folder
+            (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(spec.plain)))
+            write_json(folder / "result.json", {**(read_result(folder) or {}), "key": spec.key})
+            for file in counts_of(folder):
+                counts = Counts.load(file)
+                replace(counts, run=spec.key if counts.run else "").save(file)
+            added = add(RunResult(folder.rename(folder.with_name(spec.key))), options.archive)
+        path.unlink()
+        print_rich(plain_text(f"{path}  ->  {added}"))
     return 0
 
 
-class Compared(NamedTuple):
-    """An archived run beside the run that its command requests today.
-
-    `state` is "same" (key); "added" (another key, but only for settings that were added);
-    "changed" (other settings); or "damaged", if the command does not compose any more, too.
-    """
-
-    path: Path
-    state: str
-    reason: str = ""
-    key: str = ""
-    settings: Mapping[str, Any] = {}
+# File, state, reason and what its command requests today. The state is "same" (key); "added"
+# (another key, but only for settings that were added); "changed"; or "damaged".
+Compared = tuple[Path, str, str, "RunSpec | None"]
 
 
 def _compared(archive: Path) -> Iterator[Compared]:
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
     with tempfile.TemporaryDirectory() as scratch:
-        for path in archived(archive):
+        for path in track(archived(archive), "runs", console=Console(stderr=True), transient=True):
             try:
-                yield _compare(path, unpack(path, Path(scratch)))
-            except (InputError, HydraException, OmegaConfBaseException) as error:
-                yield Compared(path, "damaged", str(error))
+                with _undamaged(path):
+                    stored = unpack(path, Path(scratch))
+                    stored.check()
+                    found = _compare(path, stored)
+            except InputError as error:
+                found = path, "damaged", str(error), None
+            yield found
 
 
 def _compare(path: Path, stored: RunResult) -> Compared:
-    from rgbt.config.compose import compose, flatten
-    from rgbt.runs.run_spec import NOT_IN_KEY
-    from rgbt.runs.specify import requested_run
+    from rgbt.config.compose import flatten
+    from rgbt.runs.run_spec import is_in_key
+    from rgbt.runs.specify import request_again
 
-    words, settings = stored.description.overrides, stored.settings
-    # The command of an upstream run is that of its experiment, without the seed.
-    spec = requested_run(compose(words), words).with_seed(int(settings["seed"]))
-    if spec.is_run(stored):
-        return Compared(path, "same")
-    before, now, none = flatten(settings), flatten(spec.plain), object()
-    differing = [
-        key
-        for key in sorted(before.keys() | now.keys())
-        if before.get(key, none) != now.get(key, none)
-        and not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
-    ]
+    spec = request_again(stored.settings, stored.description.overrides)
+    before, now, none = flatten(stored.settings), flatten(spec.plain), object()
+    keys = sorted(filter(is_in_key, before.keys() | now.keys()))
+    differing = [key for key in keys if before.get(key, none) != now.get(key, none)]
+    if not differing and spec.is_run(stored):
+        return path, "same", "", spec
     # Nothing says how an upstream run differs.
     is_added = bool(differing) and all(key not in before for key in differing)
     reason = ", ".join(differing) or "a run that it depends on"
-    return Compared(path, "added" if is_added else "changed", reason, spec.key, spec.plain)
+    return path, "added" if is_added else "changed", reason, spec
 
 
 entry = CommandGroup(

@@ -103,6 +103,16 @@ def check_equal_runs(request: TableRequest, planner: Planner) -> None:
             )
 
 
+def row_digests(request: TableRequest, planner: Planner) -> dict[str, str]:
+    """The digest of the settings of every trained row alone, without what was typed for all.
+
+    By it a report knows whether a row is the one of today, without composing the words of a run.
+    """
+    alone = replace(request, extra=(), pretrained={})
+    rows = request.trained_rows
+    return {row.label: planner.row_digest(alone.overrides(row.label, 0)) for row in rows}
+
+
 def _origins(table: Table) -> dict[str, str]:
     """Label of every row -> the first of the rows that may be the same run."""
     origin: dict[str, str] = {}
@@ -200,6 +210,8 @@ def plan_table(
     request, rows = make_request(typed, options.rows, both=both)
     if extra or is_own(options.table):  # a test checks the others
         check_equal_runs(request, planner)
+    if request.deciding_words():
+        request = replace(request, digests=row_digests(request, planner))
     if adds and not request.table.claims:
         raise InputError(
             f"seeds=until_decided: {name} has no claims with these rows; give a number of seeds, "

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,11 @@ DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
 
 # Target that executes code of the folder in its setting `checkout`.
 EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
+
+# The key of a setting or group; what in any value acts; what in that of a group is a place.
+KEY = re.compile(r"[a-z_]\w*([./][a-z_]\w*)*", re.IGNORECASE | re.ASCII)
+ACTS = re.compile(r"\$\{|_target_|[\x00-\x1f\x7f]")
+PLACE = re.compile(r"^[\"']?[/~]|(^|/)\.\.(/|$)|://")
 
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
 
@@ -99,6 +104,20 @@ def checkouts(settings: Any) -> dict[str, str]:
     nodes = (key.rpartition(".")[0] for key, each in found.items() if each == EXTERNAL)
     keys = (f"{node}.checkout".lstrip(".") for node in nodes)
     return {key: str(found[key]) for key in keys if key in found}
+
+
+def check_words(words: Iterable[str], source: str) -> None:
+    """Refuse stored words of a command that could do more than choose a file or set a value.
+
+    Such words are shown for the user to type; none is ever composed. InputError names the word.
+    """
+    for word in words:
+        key, equals, value = word.lstrip("+~").partition("=")
+        is_plain = KEY.fullmatch(key) and (equals or word.startswith("~"))
+        is_hydra = key.split(".")[0].split("/")[0] == "hydra"
+        is_place = "." not in key and PLACE.search(value)
+        if not is_plain or is_hydra or key == "trust" or is_place or ACTS.search(value):
+            raise InputError(f"{source}: the word {_shown(word)} is not one of a setting.")
 
 
 def parse_trust(text: str) -> tuple[str, ...]:

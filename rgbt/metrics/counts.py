@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,9 +13,15 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.metrics.archive import Archive
-from rgbt.metrics.details import details_of
-from rgbt.metrics.metric import Absent
+from rgbt.metrics.details import details_of, regions_of
+from rgbt.metrics.metric import Absent, number_of_regions
 from rgbt.metrics.names import DAY, NIGHT
+
+# What partition, data set, split and run are written with; they are parts of names of files.
+WORD = re.compile(r"[\w.+-]*")
+
+# More than the pixels of any image, in the units of `rgbt.metrics.details`; sums do not overflow.
+MOST = 2**40
 
 ARCHIVE = Archive("rgbt counts 2", "counts", "evaluate the run to write it")
 
@@ -68,6 +75,10 @@ class Counts:
     def scored(self) -> NDArray[np.bool_]:
         """(K,): which classes take part in means over classes."""
         return scored_classes(self.classes, self.unscored)
+
+    def labelled(self) -> NDArray[np.int64]:
+        """(N, R, K): pixels with each label."""
+        return np.asarray(self.counts.sum(-1, dtype=np.int64))
 
     def by_region(self) -> NDArray[np.int64]:
         """(R, K, K): all images together."""
@@ -129,7 +140,26 @@ class Counts:
         for key in ("names", "classes", "unscored"):
             given[key] = tuple(arrays[key].tolist())
         night = tuple(arrays["night"].astype(bool).tolist()) or None
-        return cls(counts=arrays["counts"], night=night, **given)
+        found = cls(counts=arrays["counts"], night=night, **given)
+        found.check()
+        return found
+
+    def check(self) -> None:
+        """Refuse what no evaluation writes, but somebody may have stored, by ValueError."""
+        details = details_of(self.partition)
+        rows = number_of_regions(regions_of(self.partition)) * (details.groups if details else 1)
+        if rows and self.counts.shape[1] != rows:
+            raise ValueError(f"counts: expected {rows} rows, as {self.partition} has.")
+        ends = (self.counts.min(), self.counts.max()) if self.counts.size else (0, 0)
+        if ends[0] < 0 or ends[1] > MOST:
+            raise ValueError(f"counts: expected numbers of pixels, got {ends[0]} to {ends[1]}.")
+        for key in ("partition", "dataset", "split", "run"):
+            if not WORD.fullmatch(getattr(self, key)):
+                raise ValueError(f"{key}: expected letters, digits and _.+-.")
+        for key in ("names", "classes"):
+            texts = getattr(self, key)
+            if len(set(texts)) < len(texts) or not all(text.isprintable() for text in texts):
+                raise ValueError(f"{key}: expected different texts without control characters.")
 
     def _take(self, indices: list[int]) -> Counts:
         names = tuple(self.names[index] for index in indices)

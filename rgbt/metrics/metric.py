@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from annotated_types import Interval
@@ -46,6 +47,12 @@ class Regions:
     def map(self, image_hw: tuple[int, int]) -> RegionMap:
         """(H, W) region index of every pixel, read-only; InputError: the image is too small."""
         return _region_map(self, image_hw)
+
+
+def number_of_regions(name: str) -> int:
+    """The regions of a partition with this name (`Regions.name`); 0: another partition."""
+    found = re.fullmatch(rf"({'|'.join(get_args(Partition))})(\d+)(_released_3_4)?", name)
+    return int(found[2]) if found else 0
 
 
 @lru_cache(maxsize=16)

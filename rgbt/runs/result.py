@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
 from rgbt.files.plain_files import check_links
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.names import in_percent
+from rgbt.metrics.metric import Regions
+from rgbt.metrics.named import value
+from rgbt.metrics.names import CA, CA_RELEASED, consistency, in_percent, subset
+from rgbt.metrics.pairs import HEADLINES, protocol_of
+from rgbt.metrics.scores import summary
 from rgbt.runs.folder import (
     ADVICE,
     Description,
@@ -56,10 +64,10 @@ class RunResult:
 
     @property
     def result(self) -> dict[str, Any]:
-        """``result.json`` (`rgbt.training.train`); InputError where it names no data set."""
+        """``result.json`` (`rgbt.training.train`); InputError without its key or data set."""
         result, path = read_result(self.folder), self.folder / "result.json"
-        if result is None or "dataset" not in result:
-            raise InputError(f"{path} is missing or names no data set; {ADVICE}.")
+        if result is None or not {"key", "dataset"} <= result.keys():
+            raise InputError(f"{path} is missing or names no run or data set; {ADVICE}.")
         return result
 
     @property
@@ -131,16 +139,74 @@ class RunResult:
         path = self.folder / (split if split.endswith(".npz") else counts_name(split))
         if path.is_file() or split.endswith(".npz"):
             counts = Counts.load(path)
-            if counts.run not in ("", self.key) and not self.run_id:
-                raise InputError(
-                    f"{path} has counts of the run {counts.run}, not of {self.key}; restore the "
-                    "file of this run, or give its folder the name of the run."
-                )
+            self._check_fits(counts, path)
             return counts
         how = "rerun the command of the run to finish it"
         if self.is_finished:
             how = f"write them with: rgbt evaluate run={self.folder} split={split} out={path}"
         raise InputError(f"{self.folder} has no counts of the split '{split}'; {how}.")
+
+    def _check_fits(self, counts: Counts, path: Path) -> None:
+        """InputError: counts of another run, or not of the labels that its own counts are of."""
+        advice = "restore the file of this run, or give its folder the name of the run"
+        if counts.run not in ("", self.key) and not self.run_id:
+            raise InputError(
+                f"{path} has counts of the run {counts.run}, not of {self.key}; {advice}."
+            )
+        result = read_result(self.folder)
+        if result is None or counts.dataset != result.get("dataset"):
+            if result is not None and path.parent == self.folder:
+                raise InputError(f"{path} has counts of other images than the run; {advice}.")
+            return
+        first = self.folder / counts_name(counts.split)
+        if path == first or not first.is_file() or protocol_of(counts.partition):
+            return
+        own = Counts.load(first)
+        if (own.names, own.night, own.classes) != (counts.names, counts.night, counts.classes):
+            raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")
+        is_alike = own.partition == counts.partition
+        if is_alike and not np.array_equal(own.labelled(), counts.labelled()):
+            raise InputError(f"{path} has counts of other labels than {first.name}; {advice}.")
+
+    def check(self) -> None:
+        """Compare the stored scores with those of the stored counts, and these with the settings.
+
+        InputError: a score differs or is missing, or a file is damaged. A score whose counts the
+        folder does not hold cannot be compared.
+        """
+        for path in (*self.folder.glob(ALL_COUNTS), *self.folder.glob("evaluations/**/*.npz")):
+            self.counts(path.relative_to(self.folder).as_posix())
+        metric = {key: each for key, each in self.settings["metric"].items() if key != "_target_"}
+        own, given = self.counts(), self.result.get("test", {})
+        if metric.keys() == Regions.__annotations__.keys():  # not of a user's own class
+            wanted = Regions(**metric)
+            if (own.partition, own.absent) != (wanted.name, wanted.absent):
+                said = f"{own.partition} ({own.absent}), not of {wanted.name} ({wanted.absent})"
+                raise InputError(f"{self.folder} has counts of {said}; {ADVICE}.")
+        scores = {name: [score] for name, score in summary(own, own.absent).items()}
+        for name, score in self._further_scores():
+            if name in given:
+                scores.setdefault(name, []).append(score)
+        for name, found in scores.items():
+            stored = math.nan if given.get(name) is None else given[name]
+            if not np.isclose(found, stored, rtol=0, atol=1e-9, equal_nan=True).any():
+                raise InputError(
+                    f"{self.folder / 'result.json'} has {name} {stored}, but its counts give "
+                    f"{found[0]}; {ADVICE}."
+                )
+
+    def _further_scores(self) -> Iterator[tuple[str, float]]:
+        """Scores of other views, heads and pairs of frames, by their names in ``result.json``."""
+        for path in sorted(self.folder.glob("counts_test_*.npz")):
+            counts = self.counts(path.name)
+            for name, score in summary(counts, counts.absent).items():
+                yield subset(path.stem.removeprefix("counts_test_"), name), score
+        for path in sorted(self.folder.glob("evaluations/consistency_*_test.npz")):
+            counts = self.counts(f"evaluations/{path.name}")
+            protocol = protocol_of(counts.partition)
+            for name in HEADLINES[protocol][:2] if protocol else ():
+                key = consistency(CA if name == CA_RELEASED else name, protocol)
+                yield key, value(name, counts, counts.absent) / 100
 
     def has_counts(self, path: str, *, other_dataset: bool = False) -> bool:
         """Whether the file `path` of the folder holds test counts that this training made.

@@ -458,6 +458,12 @@ NOT_IN_KEY = (
     *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
 )
 
+
+def is_in_key(key: str) -> bool:
+    """Whether the setting with a dotted key is part of the run key."""
+    return not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
+
+
 # Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
 # the scale. A duration is that of the scale unless it was typed.
 SHARED = (

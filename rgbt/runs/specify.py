@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, cast, get_args
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS
@@ -29,7 +29,9 @@ from rgbt.config.compose import (
     own_folders,
     register_resolvers,
     resolved,
+    top_level,
 )
+from rgbt.config.stored_config import KEY
 from rgbt.config.values import check_value
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.ranges import Seed
@@ -229,6 +231,44 @@ def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) 
         if path not in own and (path in always or in_group):
             found.append(word)
     return found
+
+
+def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
+    """The run that today's files request by the command of a stored run; none of its words acts.
+
+    A word that chooses a file is composed if a file of ours, or of the user, has that name. A word
+    that sets a value only names it: the value is that of the stored settings. Others do nothing.
+
+    Args:
+        settings: plain values of its configuration, from which nothing is built.
+        words: the overrides of its command.
+
+    Raises:
+        InputError, HydraException, OmegaConfBaseException: today's files do not fit together.
+    """
+    nodes, values = top_level()
+    chosen, typed = [], []
+    for word in words:
+        key, _, name = word.lstrip("+~").partition("=")
+        root = key.replace("/", ".").partition(".")[0]
+        if not KEY.fullmatch(key) or root not in (*nodes, *values, "experiment", "debug"):
+            continue
+        if "." not in key and name in available(key):
+            chosen.append(f"+{key}={name}" if word[0] == "+" else f"{key}={name}")
+        elif "/" not in key:
+            typed.append(key)
+    config = compose(chosen)
+    for key in typed:
+        *parents, last = key.split(".")
+        stored: Any = settings
+        for name in parents:
+            stored = stored.get(name) or {}
+        with open_dict(config):
+            if last in stored:
+                OmegaConf.update(config, key, stored[last], merge=False, force_add=True)
+            elif parents and (node := OmegaConf.select(config, ".".join(parents))) is not None:
+                node.pop(last, None)
+    return requested_run(config).with_seed(int(settings["seed"]))
 
 
 def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:

@@ -79,7 +79,8 @@ def grid_of(result: TableResult, style: Style) -> TextTable:
     words = [word for word in request.typed if word.startswith(("weights.", "predictions."))]
     spread = "so that their spread over trainings is not known"
     remarks = [f"Not trained here, {spread}: {'; '.join(words)}."] if words else []
-    return render_table(result.scored, style, request.typed_overrides(), remarks)
+    typed = (*request.typed_overrides(), *result.words)
+    return render_table(result.scored, style, typed, remarks)
 
 
 def grids_of(result: TableResult) -> list[TextTable]:

@@ -74,7 +74,7 @@ class TableView:
         self.result, self.is_run = result, bool(result.runs)
         self.name = folder if slash else STUDIES
         form = "released form" if request.form == "released" else ""
-        words = " ".join(request.extra)
+        words = shlex.join(result.words)
         self.how = ", ".join(filter(None, (f"scale={request.scale}", form, words)))
         title = request.table.number if slash else request.name
         self.title = f"{title} ({self.how})" if self.is_run else title
@@ -86,13 +86,14 @@ class TableView:
         self.grids = list(map(markdown, grids)) if self.is_run else []
         rows = {label for label, _ in result.runs}
         self.drawn = drawn_of(result) if len(rows) > 1 else None  # one row compares nothing
-        file = f"{request.name.replace('/', '-')}_{request.variant}.svg"
+        variant = replace(request, extra=result.words).variant
+        file = f"{request.name.replace('/', '-')}_{variant}.svg"
         self.figure = file if self.drawn is not None else ""
         count = str(len(seeds)) if seeds == tuple(range(len(seeds))) else ",".join(map(str, seeds))
         typed = [f"table={request.name}", f"seeds={count if seeds else 3}"]
         typed += [] if request.scale == "demo" else [f"scale={request.scale}"]
         typed += [] if request.form == "paper" else [f"form={request.form}"]
-        self.command = shlex.join(["rgbt", "reproduce", *typed, *request.extra])
+        self.command = shlex.join(["rgbt", "reproduce", *typed, *result.words])
 
 
 class PaperView:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
+from rgbt.runs.naming import MACHINE_OVERRIDES
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.table.cells import evaluation_of, is_counted, world_evaluations
@@ -22,6 +24,10 @@ DEFAULT_SCALE = "demo"  # The scale of a run without ``scale=...``
 TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
 PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
 TAG_LENGTH = 5000
+
+# Prefix of the tag that says how the rows were requested, where that is not plainly: their form,
+# the digest of the settings of the row alone, and the words that were typed for all rows.
+REQUESTED = "rgbt.requested/"
 
 # Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
 # their table must be valid at any time.
@@ -39,6 +45,7 @@ class TableRequest:
         evaluated: labels of rows that are evaluated and not trained (`sweeps.table.external`).
         typed: further options that make it another table, as they were typed.
         until_decided: whether seeds are added until claims are decided, which runs record.
+        digests: of the settings of the rows without `extra` and `pretrained`, by label.
     """
 
     name: str
@@ -51,6 +58,7 @@ class TableRequest:
     evaluated: tuple[str, ...] = ()
     typed: tuple[str, ...] = ()
     until_decided: bool = False
+    digests: Mapping[str, str] = field(default_factory=dict)
 
     def overrides(self, label: str, seed: int) -> tuple[str, ...]:
         """Overrides of the run of row `label` with that seed."""
@@ -80,11 +88,24 @@ class TableRequest:
         points = []
         for overrides, labels in sharing.items():
             more = f" (and {len(labels) - 1} more)" if len(labels) > 1 else ""
-            tags = {TAG + self.name: " | ".join(labels)[:TAG_LENGTH]}
-            tags |= {UNTIL_DECIDED + self.name: "true"} if self.until_decided else {}
             label, evaluations = f"{labels[0]}{more} {overrides[-1]}", self.evaluations(labels)
-            points.append(Point(label, overrides, tags=tags, evaluations=evaluations))
+            points.append(Point(label, overrides, tags=self.tags(labels), evaluations=evaluations))
         return points
+
+    def tags(self, labels: Sequence[str]) -> dict[str, str]:
+        """MLflow tags of the run of the rows `labels`: what it was requested for, and how."""
+        tags = {TAG + self.name: " | ".join(labels)[:TAG_LENGTH]}
+        tags |= {UNTIL_DECIDED + self.name: "true"} if self.until_decided else {}
+        words = self.deciding_words()
+        if words or self.form != "paper":
+            how = [self.form, self.digests.get(labels[0], ""), *words]
+            tags[REQUESTED + self.name] = shlex.join(how)
+        return tags
+
+    def deciding_words(self) -> list[str]:
+        """The words typed for all rows that are of the runs, and not of the machine."""
+        typed = self.typed_overrides()
+        return [word for word in typed if not word.lstrip("+~").startswith(MACHINE_OVERRIDES)]
 
     def evaluations(self, labels: Collection[str] | None = None) -> tuple[ExtraEvaluation, ...]:
         """Further evaluations of the runs of the rows `labels`; None: of all rows that are run."""

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import get_args
+from typing import NamedTuple, cast, get_args
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, check_choice, one_line
+from rgbt.config.compose import available
+from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from sweeps.point import Outcome, Point
 from sweeps.table.cells import ScoredTable, score, size_marks
 from sweeps.table.efficiency import network_sizes
-from sweeps.table.request import DEFAULT_SCALE, TAG, TableRequest
+from sweeps.table.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
 from sweeps.table.table import RELEASED, Form, Table, load_table, study_names, table_names
 from sweeps.verdicts.effects import Effects, effects_of
 from sweeps.verdicts.judge import (
@@ -29,6 +31,9 @@ from sweeps.worker.planner import Planner
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 
+# Errors that the tags of a run may raise that somebody has edited.
+ODD = (InputError, KeyError, ValueError, TypeError)
+
 
 class FinishedRuns:
     """Finished runs by seed and key, and the seeds of experiments; one that is odd is a remark."""
@@ -42,7 +47,7 @@ class FinishedRuns:
                 seed, experiment = int(run.tags[SEED]), run.tags[EXPERIMENT]
                 self.by_seed.setdefault(seed, {})[run.key] = run
                 self.seeds.setdefault(experiment, set()).add(seed)
-            except (InputError, KeyError, ValueError, TypeError) as error:
+            except ODD as error:
                 self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
 
     def run_of(self, spec: RunSpec) -> RunResult | None:
@@ -84,11 +89,12 @@ def stored_runs(
 
 @dataclass(frozen=True)
 class TableResult:
-    """What the finished runs of a table show."""
+    """What the finished runs of a table show; `words` were typed for every row, as they tell."""
 
     request: TableRequest
     runs: Mapping[CellRunId, Outcome]
     judge: TableJudge
+    words: tuple[str, ...] = ()
 
     @cached_property
     def scored(self) -> ScoredTable:
@@ -112,13 +118,22 @@ class TableResult:
         return None if self.request.table.design is None else effects_of(self.judge, self.runs)
 
 
-@dataclass(frozen=True, order=True)
-class Variant:
-    """How a table was run; `extra` are overrides of every row."""
+class Variant(NamedTuple):
+    """How a table was run; `words` were typed for every row."""
 
     scale: str = DEFAULT_SCALE
     form: Form = "paper"
-    extra: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+
+
+def _requested_as(run: RunResult, table: str) -> tuple[Variant, str]:
+    """How a run was requested for a table, and the digest of its row; InputError or `ODD`."""
+    form, digest, *words = shlex.split(run.tags.get(REQUESTED + table, "paper ''"))
+    check_words(words, f"the tag {REQUESTED}{table}")
+    scale = run.settings["scale"]["name"]
+    check_choice("form", form, get_args(Form))
+    check_choice("scale", scale, available("scale"))
+    return Variant(scale, cast(Form, form), tuple(words)), digest
 
 
 def known_tables(remarks: list[str]) -> dict[str, Table]:
@@ -153,38 +168,25 @@ class TableResults:
         self.stored = StoredRuns()
         self.remarks += self.finished.remarks
 
-    def variants(self) -> dict[str, list[Variant]]:
-        """Name of every table that runs are tagged with -> how it was run."""
-        found: dict[str, set[Variant]] = {}
-        for run in self.finished:
-            tagged = {
-                tag.removeprefix(TAG): labels.split(" | ")
-                for tag, labels in run.tags.items()
-                if tag.startswith(TAG) and tag.removeprefix(TAG) in self.tables
-            }
-            words = [each for each in run.description.overrides if not each.startswith("seed=")]
-            scales = [each.removeprefix("scale=") for each in words if each.startswith("scale=")]
-            scale = scales[-1] if scales else DEFAULT_SCALE
-            # Tables share runs: the rows of one of them tell what else was typed.
-            fitting = [
-                each for pair in tagged.items() for each in self._fitting(*pair, words, scale)
-            ]
-            variant = min(fitting, key=lambda each: len(each.extra), default=Variant(scale))
-            for name in tagged:
-                found.setdefault(name, set()).add(variant)
-        return {name: sorted(each) for name, each in sorted(found.items())}
+    @cached_property
+    def requested(self) -> dict[tuple[str, Variant], list[tuple[str, str, RunResult]]]:
+        """Table and variant -> label of a row, its digest, and the run that was requested for it.
 
-    def _fitting(
-        self, name: str, labels: Sequence[str], words: Sequence[str], scale: str
-    ) -> Iterator[Variant]:
-        """How the command of a run with these words may have requested rows of a table."""
-        known = {row.label for row in self.tables[name].rows}
-        for label in known & {each.removesuffix(RELEASED) for each in labels}:
-            for form in get_args(Form):
-                request = TableRequest(name, self.tables[name], scale, (0,), form=form)
-                own = request.overrides(label, 0)[:-1]
-                if not Counter(own) - Counter(words):
-                    yield Variant(scale, form, tuple(each for each in words if each not in own))
+        The digest is that of the settings of the row alone, when it was requested.
+        """
+        found: dict[tuple[str, Variant], list[tuple[str, str, RunResult]]] = {}
+        for run in self.finished:
+            named = [tag.removeprefix(TAG) for tag in run.tags if tag.startswith(TAG)]
+            try:
+                for name in (name for name in named if name in self.tables):
+                    variant, digest = _requested_as(run, name)
+                    for label in run.tags[TAG + name].split(" | "):
+                        own = label.removesuffix(RELEASED)
+                        way = variant if own == label else variant._replace(form="released")
+                        found.setdefault((name, way), []).append((own, digest, run))
+            except ODD as error:
+                self.remarks.append(f"Run {run.key} belongs to no table: {one_line(error)}.")
+        return found
 
     def of(self, name: str, variant: Variant | None = None) -> TableResult:
         """The result of one table; without a variant it has no runs.
@@ -192,36 +194,50 @@ class TableResults:
         InputError: no row can be composed.
         """
         how = variant or Variant()
-        table = self.tables[name]
-        request = TableRequest(name, table, how.scale, (0,), how.extra, form=how.form)
-        return self.result(request, {} if variant is None else None)
+        request = TableRequest(name, self.tables[name], how.scale, (0,), form=how.form)
+        if variant is None:
+            return self.result(request, {})
+        runs = self._by_tags(request, variant) if variant.words else None
+        return self.result(request, runs, words=variant.words)
+
+    def _by_tags(self, request: TableRequest, variant: Variant) -> dict[CellRunId, Outcome]:
+        """The runs with further words, which are not composed: of rows that are the same today."""
+        labels, runs = {row.label for row in request.trained_rows}, dict[CellRunId, Outcome]()
+        for label, before, run in self.requested[request.name, variant]:
+            digest = self.planner.row_digest(request.overrides(label, 0)) if label in labels else ""
+            if digest and digest == before:
+                outcome = Outcome(Point(label, ()), "finished", results=(run,))
+                runs[label, int(run.tags[SEED])] = outcome
+        return runs
 
     def result(
         self,
         request: TableRequest,
         runs: Mapping[CellRunId, Outcome] | None = None,
         *,
+        words: tuple[str, ...] = (),
         checked: bool = False,
     ) -> TableResult:
         """The result of a request by `runs`; None: by all finished ones, see `stored_runs`."""
         if runs is None:
             runs = stored_runs(request, self.finished, self.planner, checked=checked)
-        sizes = network_sizes(request) if self.counted else {}
+        sizes = network_sizes(request) if self.counted and not words else {}
         rule = rule_of(result for run in runs.values() for result in run.results)
         name, table = request.name, request.table
         judge = TableJudge(name, table, rule, self.resamples, sizes, self.stored)
-        return TableResult(request, runs, judge)
+        return TableResult(request, runs, judge, words)
 
     def __iter__(self) -> Iterator[TableResult]:
         """Tables with runs in every way that they were run, then those without a run.
 
         Tables share runs, so a way without further words is tried for each of them.
         """
-        variants, waiting = self.variants(), []
-        plain = {each for ways in variants.values() for each in ways if not each.extra}
+        plain = {variant for _, variant in self.requested if not variant.words}
+        waiting = []
         for name in self.tables:
+            own = {variant for table, variant in self.requested if table == name}
             found = []
-            for variant in sorted({*variants.get(name, ()), *plain}):
+            for variant in sorted(own | plain):
                 try:
                     result = self.of(name, variant)
                     _ = result.runs and (result.scored, result.claims)  # an error is a remark here
@@ -231,7 +247,7 @@ class TableResults:
             found = [result for result in found if result.runs]
             yield from found
             waiting += [] if found else [name]
-            if name in variants and not found:
+            if own and not found:
                 self.remarks.append(
                     f"No run that is tagged with '{name}' has the key of a row today."
                 )

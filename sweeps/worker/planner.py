@@ -12,7 +12,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import compose, with_pixels
 from rgbt.runs.provenance import without_passwords
-from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
 from sweeps import attributes as names
 from sweeps.point import Point
@@ -81,6 +81,13 @@ class Planner:
                 raise InputError(f"dataset.root={dataset.root}: it has none of the files {paths}.")
             self._fingerprints[name] = str(dataset.fingerprint())
         return self._fingerprints[name]
+
+    def row_digest(self, overrides: tuple[str, ...]) -> str:
+        """The digest of the settings that `overrides` request; "" where they do not fit alone."""
+        try:
+            return settings_digest(self.specify((*self.base, *overrides), checked=False).plain)
+        except InputError:
+            return ""
 
     def specify(self, overrides: tuple[str, ...], *, checked: bool = True) -> RunSpec:
         """The specification of one run (`specify_run`); seeds of the same run are composed once."""

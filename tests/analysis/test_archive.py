@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import zipfile
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,8 +15,10 @@ from omegaconf import OmegaConf
 
 from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
-from rgbt.runs.folder import RunFolder
+from rgbt.metrics.scores import summary
+from rgbt.runs.folder import RunFolder, read_result
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult
 from tests.analysis.counts import counts_of
@@ -25,8 +29,15 @@ from tests.composed import specified
 WORDS = ("+experiment=crm", "+debug=smoke")
 
 
+DATA = "abc"
+LABELLED = 3600  # pixels of every label in every region and image
+
+
 def some(seed: int, **changed: object) -> Counts:
-    return counts_of(np.random.default_rng(seed).integers(0, 900, (12, 5, 4, 4)), **changed)
+    """Counts of one set of labels, with predictions of their own."""
+    counts = np.random.default_rng(seed).integers(0, 900, (12, 5, 4, 4))
+    counts[..., 3] = LABELLED - counts[..., :3].sum(-1)
+    return counts_of(counts, **{"dataset": DATA, **changed})
 
 
 PAIRS = counts_of(np.random.default_rng(9).integers(0, 9, (12, 15, 4, 4)), partition="aligned3")
@@ -34,6 +45,13 @@ PAIRS = counts_of(np.random.default_rng(9).integers(0, 9, (12, 15, 4, 4)), parti
 
 # No table reads these.
 NOT_ARCHIVED = ("counts_test_source_head.npz", "counts_val.npz", "evaluations/val_rgb.npz")
+
+
+def finish(folder: Path, counts: Counts) -> None:
+    """Write the counts of a run, and the result that they give."""
+    counts.save(folder / "counts_test.npz")
+    result = {"key": folder.name, "dataset": counts.dataset, "test": summary(counts, "released")}
+    RunFolder(folder).finish(result)
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +63,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
     folder.describe(describe(spec))
     folder.add_provenance({"git_commit": "a" * 40, "cwd": "/home/me", "packages": {"torch": "2"}})
-    some(0, run=spec.key).save(folder.path / "counts_test.npz")
     some(0, run=spec.key).save(folder.path / "counts_test_source_head.npz")
     (folder.path / "evaluations").mkdir()
     for name in NOT_ARCHIVED[1:]:
         some(0, run=spec.key, split="val").save(folder.path / name)
-    replace(some(1), night=(True, False) * 6).save(folder.path / "evaluations/test_rgb.npz")
+    some(1).save(folder.path / "evaluations/test_rgb.npz")
     PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
     write_levels(folder.path / "evaluations/robustness/test", SCORES)
-    folder.finish({"key": spec.key, "dataset": "abc", "test": {"mIoU": 0.5}})
+    finish(folder.path, some(0, run=spec.key))
     add(RunResult(folder.path), root / "results")
     return RunResult(folder.path)
 
@@ -105,7 +122,7 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
         (run.folder / name).unlink()
     whole = unpack(archive / f"{run.key}.zip", tmp_path / "unpacked").folder
     assert all((whole / name).is_file() for name in further)
-    some(2, run=run.key).save(run.folder / "counts_test.npz")
+    finish(run.folder, some(2, run=run.key))
     other = add(run, archive)
     assert key_of(other) == run.key
     assert unpack(other, tmp_path / "unpacked").counts().run == run.key
@@ -115,21 +132,21 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
 def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> None:
     wrong = some(0).counts.copy()
     wrong[..., 0, 1] += 1  # another prediction of a pixel with the same label
-    wrong[..., 0, 0] -= 1
+    wrong[..., 0, 3] -= 1
     before = len(list((tmp_path / "results/shared").iterdir()))
-    replace(some(0), counts=wrong).save(run.folder / "counts_test.npz")
+    finish(run.folder, replace(some(0), counts=wrong))
     wrong = PAIRS.counts.copy()
     wrong[:, 1, 3, 2] += wrong[:, 1, 1, 1]  # of pixels with label 1 in both frames
     wrong[:, 1, 1, 1] = 0
     replace(PAIRS, counts=wrong).save(run.folder / "evaluations/consistency_aligned_test.npz")
     add(run, tmp_path / "results")
-    assert len(list((tmp_path / "results/shared").iterdir())) == before == 5
+    assert len(list((tmp_path / "results/shared").iterdir())) == before == 4
 
 
 @pytest.mark.parametrize("damage", [0, -1, "shared", "/tmp/outside.txt", "../outside.txt"])
 def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: int | str) -> None:
     path = archived_in(tmp_path)
-    shared, other = sorted((tmp_path / "results/shared").iterdir())[:2]
+    shared, other = sorted((tmp_path / "results/shared").glob("*.npz.xz"))[:2]
     if isinstance(damage, int):
         with zipfile.ZipFile(path) as archive:
             member = archive.infolist()[damage]
@@ -182,8 +199,8 @@ def test_check_reports_changed_keys(
     archive = tmp_path / "other"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
-    some(0, run="0123456789ab").save(folder / "counts_test.npz")
-    (folder / "result.json").write_text('{"dataset": "abc"}')
+    (folder / "counts_test_source_head.npz").unlink()
+    finish(folder, some(0, run="0123456789ab"))
     add(RunResult(folder), archive)
     code, out, _ = call(entry, "check", f"archive={archive}")
     assert code == 1
@@ -202,5 +219,87 @@ def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Pa
     assert call(entry, "add", "run=all", *words)[0] == 0
     assert [each.stem for each in archived(archive)] == [run.key]
     code, out, err = call(entry, "check", f"archive={archive}")
-    assert (code, err) == (0, "")
-    assert "1 runs, 1 have the key of their command" in out
+    assert (code, err.strip()) == (0, "")
+    assert "1 runs, 1 have the scores of their counts and today's key" in out
+
+
+def moved_pixel() -> Counts:
+    """`some(0)` with one wrong pixel more; every label has as many pixels."""
+    counts = some(0).counts.copy()
+    counts[0, 0, 1, 1] -= 1
+    counts[0, 0, 1, 2] += 1
+    return replace(some(0), counts=counts)
+
+
+def below_zero() -> Counts:
+    counts = some(0).counts.copy()
+    counts[0, 0, 0, 0] = -2_130_706_432
+    return replace(some(0), counts=counts)
+
+
+def more_labels() -> Counts:
+    return replace(some(0), counts=some(0).counts + 1)
+
+
+CODES = "\x1b[31m<script>alert(1)</script>"
+# What was changed -> the file with other counts, and the message.
+TAMPERED: dict[str, tuple[str, Callable[[], Counts], str]] = {
+    "below_zero": ("counts_test.npz", below_zero, "-2130706432"),
+    "too_many": (
+        "counts_test.npz",
+        lambda: replace(some(0), counts=some(0).counts << 40),
+        "numbers of",
+    ),
+    "another_count": ("counts_test.npz", moved_pixel, "but its counts give"),
+    "other_images": ("counts_test.npz", lambda: some(0, dataset="d"), "other images than the run"),
+    "other_names": (
+        *("evaluations/test_rgb.npz", lambda: some(1, names=tuple("abcdefghijkl"))),
+        "other images than counts_test",
+    ),
+    "other_labels": ("evaluations/test_rgb.npz", more_labels, "other labels than counts_test"),
+    "other_regions": ("counts_test.npz", lambda: some(0, partition="vertical5"), "of vertical5"),
+    "fewer_regions": ("counts_test.npz", lambda: some(0, partition="ring9"), "expected 9 rows"),
+    "codes": ("counts_test.npz", lambda: some(0, partition=f"ring5{CODES}"), "letters, digits"),
+    "codes_of_split": ("counts_test.npz", lambda: some(0, split=CODES), "letters, digits"),
+    "codes_of_class": (
+        *("counts_test.npz", lambda: some(0, classes=(CODES, "b", "c", "d"))),
+        "without control",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", [*TAMPERED, "no_key", "score", "no_score", "settings"])
+def test_changed_numbers_are_no_result(
+    call: Call, run: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    file, counts, message = TAMPERED.get(kind, ("", PAIRS, ""))
+    result = read_result(run.folder) or {}
+    if file:
+        counts().save(run.folder / file)
+    elif kind == "settings":
+        write_settings(run, sampler="bernoulli")
+        message = "masker.sampler"
+    else:
+        scores = {"score": {"mIoU": 0.99}, "no_score": {"Var": None}}.get(kind, {})
+        changed = {**result, "test": {**result["test"], **scores}}
+        write_json(
+            run.folder / "result.json",
+            {name: each for name, each in changed.items() if (kind, name) != ("no_key", "key")},
+        )
+        message = "names no run" if kind == "no_key" else "but its counts give"
+    if kind != "settings":
+        with pytest.raises(InputError, match=re.escape(message)):
+            run.check()
+        with pytest.raises(InputError):
+            add(run, tmp_path / "other")
+    with monkeypatch.context() as patch:  # a stranger packs without our checks
+        patch.setattr(Counts, "check", lambda _: None)
+        patch.setattr(RunResult, "check", lambda _: None)
+        add(run, tmp_path / "other")
+    code, out, _ = call(entry, "check", f"archive={tmp_path / 'other'}")
+    assert (code, "damaged" in out or kind == "settings", " same " in out) == (1, True, False)
+    assert message.split()[-1] in out
+    assert not {"\x1b", "<script>"} & {word for word in ("\x1b", "<script>") if word in out}
+    if file == "counts_test.npz" and kind != "another_count" and kind != "other_regions":
+        with pytest.raises(InputError):  # refused where it is read, as by a report
+            run.counts()

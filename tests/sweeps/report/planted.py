@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
-from sweeps.table.request import TAG, TableRequest
+from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
-from sweeps.table_plan import make_request
+from sweeps.table_plan import make_request, row_digests
 from sweeps.worker.planner import Planner
 from tests.sweeps.verdicts.accuracies import accuracy
 
@@ -41,12 +41,13 @@ def plant(
     """Runs of rows of a table with these accuracies by seed; `extra` are overrides of every row."""
     request, _ = make_request(TableRequest(name, load_table(name), scale, (0,), tuple(extra)))
     planner, folders = Planner((f"runs_dir={runs_dir}",)), []
+    request = replace(request, digests=row_digests(request, planner))
     for label, percents in shares.items():
         for seed, percent in enumerate(percents):
             typed = (*planner.base, *request.overrides(label, seed))
             spec = planner.specify(typed, checked=False)
             folder = RunFolder(runs_dir / spec.key)
-            folder.describe(describe(spec, {f"{TAG}{name}": label}))
+            folder.describe(describe(spec, request.tags([label])))
             folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
             folder.add_provenance(PROVENANCE)
             counts = accuracy(percent, zlib.crc32(str(seed).encode()) % 97)

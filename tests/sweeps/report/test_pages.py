@@ -135,7 +135,7 @@ def test_rows_of_a_missing_checkout_are_found_by_settings(
     shutil.rmtree(tmp_path / "Net")
     assert made().page("my") == here
     assert made(Path("none"), tmp_path / "archive").page("my") == here
-    assert [each.state for each in _compared(tmp_path / "archive")] == ["same"] * 6
+    assert [state for _, state, _, _ in _compared(tmp_path / "archive")] == ["same"] * 6
     (tmp_path / "tables" / "my" / "net.yaml").write_text(
         yaml.safe_dump(table).replace("0.2", "0.3")
     )

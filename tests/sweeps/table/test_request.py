@@ -45,7 +45,10 @@ def test_points_share_runs_of_equal_rows() -> None:
     ]
     assert points[0].overrides == ("+experiment=crm", "a.b=1", "seed=0")
     assert points[1].overrides == ("+experiment=grbm", "masker.sigma_div=2", "a.b=1", "seed=0")
-    assert points[0].tags == {"rgbt.table/own/t": "small | large"}
+    assert points[0].tags == {
+        "rgbt.table/own/t": "small | large",
+        "rgbt.requested/own/t": "paper '' a.b=1",
+    }
     assert points[0].seeds == ()
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 
