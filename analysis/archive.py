@@ -354,16 +354,12 @@ Compared = tuple[Path, str, str, "RunSpec | None"]
 
 
 def _compared(archive: Path) -> Iterator[Compared]:
-    with tempfile.TemporaryDirectory() as scratch:
-        for path in track(archived(archive), "runs", console=Console(stderr=True), transient=True):
-            try:
-                with _undamaged(path):
-                    stored = unpack(path, Path(scratch))
-                    stored.check()
-                    found = _compare(path, stored)
-            except InputError as error:
-                found = path, "damaged", str(error), None
-            yield found
+    for path in track(archived(archive), "runs", console=Console(stderr=True), transient=True):
+        try:
+            with tempfile.TemporaryDirectory() as scratch, _undamaged(path):
+                yield _compare(path, unpack(path, Path(scratch)))
+        except InputError as error:
+            yield path, "damaged", str(error), None
 
 
 def _compare(path: Path, stored: RunResult) -> Compared:
@@ -371,6 +367,7 @@ def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.runs.run_spec import is_in_key
     from rgbt.runs.specify import request_again
 
+    stored.check()
     spec = request_again(stored.settings, stored.description.overrides)
     before, now, none = flatten(stored.settings), flatten(spec.plain), object()
     keys = sorted(filter(is_in_key, before.keys() | now.keys()))

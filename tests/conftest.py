@@ -80,6 +80,7 @@ def composed_by_any_process(tmp_path_factory: pytest.TempPathFactory) -> Iterato
         path = shared / hashlib.sha256(repr(words).encode()).hexdigest()
         if not path.exists():
             write_atomic(path, alone(words, own))
+        compose.register_resolvers()  # as composing does
         return path.read_bytes()
 
     with pytest.MonkeyPatch.context() as patch:

@@ -49,7 +49,7 @@ def write_run(path: Path, group: str, seed: int, *, finished: bool = True) -> Ru
     run.describe(Description(f"seed={seed} · {group}", tags, {}))
     some_counts(seed).save(run.path / counts_name("test"))
     if finished:
-        run.finish({"dataset": "f00d", "best_step": 120})
+        run.finish({"key": path.name, "dataset": "f00d", "best_step": 120})
     return run
 
 

@@ -84,7 +84,9 @@ def run_file(path: Path) -> None:
     run.add_provenance({"command": "a", "git_commit": "0123456789", "diff": "", "cpu_usable": 2})
     run.mark({"names": "0123456789abcdef", "files": "fedcba9876543210"})
     scores = {"val": {"mIoU": 0.25}, "test": {"mIoU": 0.5, "Var": None}}
-    run.finish({"name": "grbm", "dataset": "0123456789abcdef", "best_step": 50, **scores})
+    run.finish(
+        {"name": "grbm", "key": "abc", "dataset": "0123456789abcdef", "best_step": 50, **scores}
+    )
 
 
 def pseudo(path: Path) -> None:

@@ -162,7 +162,7 @@ class RunResult:
         if path == first or not first.is_file() or protocol_of(counts.partition):
             return
         own = Counts.load(first)
-        if (own.names, own.night, own.classes) != (counts.names, counts.night, counts.classes):
+        if (own.names, own.classes) != (counts.names, counts.classes):
             raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")
         is_alike = own.partition == counts.partition
         if is_alike and not np.array_equal(own.labelled(), counts.labelled()):
@@ -176,7 +176,9 @@ class RunResult:
         """
         for path in (*self.folder.glob(ALL_COUNTS), *self.folder.glob("evaluations/**/*.npz")):
             self.counts(path.relative_to(self.folder).as_posix())
-        metric = {key: each for key, each in self.settings["metric"].items() if key != "_target_"}
+        metric = {
+            key: each for key, each in self.settings.get("metric", {}).items() if key != "_target_"
+        }
         own, given = self.counts(), self.result.get("test", {})
         if metric.keys() == Regions.__annotations__.keys():  # not of a user's own class
             wanted = Regions(**metric)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, cast, get_args
@@ -126,14 +126,23 @@ class Variant(NamedTuple):
     words: tuple[str, ...] = ()
 
 
-def _requested_as(run: RunResult, table: str) -> tuple[Variant, str]:
-    """How a run was requested for a table, and the digest of its row; InputError or `ODD`."""
-    form, digest, *words = shlex.split(run.tags.get(REQUESTED + table, "paper ''"))
-    check_words(words, f"the tag {REQUESTED}{table}")
-    scale = run.settings["scale"]["name"]
-    check_choice("form", form, get_args(Form))
-    check_choice("scale", scale, available("scale"))
-    return Variant(scale, cast(Form, form), tuple(words)), digest
+def _requested_rows(
+    run: RunResult, tables: Collection[str]
+) -> Iterator[tuple[str, Variant, str, str]]:
+    """Table, variant, label and digest of every row that the tags of a run name; raises `ODD`."""
+    for tag, labels in run.tags.items():
+        name = tag.removeprefix(TAG)
+        if tag == name or name not in tables:
+            continue
+        form, digest, *words = shlex.split(run.tags.get(REQUESTED + name, "paper ''"))
+        check_words(words, f"the tag {REQUESTED}{name}")
+        scale = run.settings["scale"]["name"]
+        check_choice("form", form, get_args(Form))
+        check_choice("scale", scale, available("scale"))
+        for label in labels.split(" | "):
+            own = label.removesuffix(RELEASED)
+            way = form if own == label else "released"
+            yield name, Variant(scale, cast(Form, way), tuple(words)), own, digest
 
 
 def known_tables(remarks: list[str]) -> dict[str, Table]:
@@ -176,14 +185,9 @@ class TableResults:
         """
         found: dict[tuple[str, Variant], list[tuple[str, str, RunResult]]] = {}
         for run in self.finished:
-            named = [tag.removeprefix(TAG) for tag in run.tags if tag.startswith(TAG)]
             try:
-                for name in (name for name in named if name in self.tables):
-                    variant, digest = _requested_as(run, name)
-                    for label in run.tags[TAG + name].split(" | "):
-                        own = label.removesuffix(RELEASED)
-                        way = variant if own == label else variant._replace(form="released")
-                        found.setdefault((name, way), []).append((own, digest, run))
+                for name, variant, label, digest in _requested_rows(run, self.tables):
+                    found.setdefault((name, variant), []).append((label, digest, run))
             except ODD as error:
                 self.remarks.append(f"Run {run.key} belongs to no table: {one_line(error)}.")
         return found

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.scores import summary
 
 
 def counts_of(array: Any, **changed: Any) -> Counts:
@@ -22,3 +23,8 @@ def counts_of(array: Any, **changed: Any) -> Counts:
         "split": "test",
     }
     return Counts(counts=counts, **(values | changed))
+
+
+def result_of(key: str, counts: Counts) -> dict[str, Any]:
+    """``result.json`` of the run `key` that ended with these counts."""
+    return {"key": key, "dataset": counts.dataset, "test": summary(counts, counts.absent)}

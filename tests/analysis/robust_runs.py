@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import Description, RunFolder
-from tests.analysis.counts import counts_of
+from tests.analysis.counts import counts_of, result_of
 
 Scores = dict[tuple[str, str, str, float], int]
 SCORES: Scores = {
@@ -50,8 +49,10 @@ def write_run(runs: Path, key: str, group: str, seed: int, scores: Scores) -> Pa
     run = RunFolder(runs / key)
     run.write_config("name: x\n")
     run.describe(Description(key, {"rgbt.group": group, "rgbt.seed": str(seed)}, {}))
-    replace(right(80), counts=right(80).counts + seed).save(run.path / "counts_test.npz")
-    run.finish({"dataset": "fingerprint"})
+    counts = right(80)
+    counts.counts[..., 0, :] += np.array([-seed, seed])  # other predictions of the same labels
+    counts.save(run.path / "counts_test.npz")
+    run.finish(result_of(key, counts))
     write_levels(run.path / "evaluations" / "robustness" / "test", scores)
     return run.path
 

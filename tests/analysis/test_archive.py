@@ -17,11 +17,10 @@ from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.scores import summary
 from rgbt.runs.folder import RunFolder, read_result
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult
-from tests.analysis.counts import counts_of
+from tests.analysis.counts import counts_of, result_of
 from tests.analysis.robust_runs import SCORES, write_levels
 from tests.commands import Call
 from tests.composed import specified
@@ -50,8 +49,7 @@ NOT_ARCHIVED = ("counts_test_source_head.npz", "counts_val.npz", "evaluations/va
 def finish(folder: Path, counts: Counts) -> None:
     """Write the counts of a run, and the result that they give."""
     counts.save(folder / "counts_test.npz")
-    result = {"key": folder.name, "dataset": counts.dataset, "test": summary(counts, "released")}
-    RunFolder(folder).finish(result)
+    RunFolder(folder).finish(result_of(folder.name, counts))
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +197,8 @@ def test_check_reports_changed_keys(
     archive = tmp_path / "other"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
-    (folder / "counts_test_source_head.npz").unlink()
+    for name in NOT_ARCHIVED:
+        (folder / name).unlink()
     finish(folder, some(0, run="0123456789ab"))
     add(RunResult(folder), archive)
     code, out, _ = call(entry, "check", f"archive={archive}")

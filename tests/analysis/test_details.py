@@ -19,6 +19,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details
 from rgbt.metrics.named import value
 from rgbt.metrics.scores import ece
+from rgbt.runs.folder import RunFolder
 from tests.analysis import counts as makes
 from tests.analysis.test_results import make_run
 from tests.analysis.uncertainty.simulated import pairs_of
@@ -93,7 +94,10 @@ def runs(tmp_path: Path) -> Path:
     runs = tmp_path / "runs"
     for seed in range(2):
         folder = make_run(runs, f"plain{seed}", "plain", seed)
-        dataset = Counts.load(folder / "counts_test.npz").dataset
+        plain = counts_of(np.full((IMAGES, 2, 2, 2), 1 + seed), "ring2")
+        dataset = plain.dataset
+        plain.save(folder / "counts_test.npz")
+        RunFolder(folder).finish(makes.result_of(folder.name, plain))
         for view in ("rgbt", "thermal"):
             for kind, made in (("boundary", boundaries(seed)), ("calibration", calibrated(seed))):
                 (folder / "evaluations").mkdir(exist_ok=True)

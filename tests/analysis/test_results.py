@@ -27,6 +27,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
 from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.runs.result import RunResult
+from tests.analysis.counts import result_of
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
 
@@ -48,7 +49,7 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
     (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
     if finished:
-        run.finish({"dataset": "simulated", "test": {"mIoU": 0.5}})
+        run.finish(result_of(key, some(seed)))
     return run.path
 
 
@@ -193,8 +194,7 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     ):
         each.save(folder / f"evaluations/{name}.npz")
     replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
-    for path in write_levels(folder / "evaluations/robustness/test", SCORES).glob("*.npz"):
-        replace(Counts.load(path), dataset="simulated").save(path)
+    write_run(runs, "fff0", "robust", 0, SCORES)
     frame = results(runs, archive)
     at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
     assert not frame.duplicated(at).any()

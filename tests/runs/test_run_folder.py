@@ -206,7 +206,9 @@ def run(tmp_path: Path) -> RunResult:
     counts().save(folder.path / counts_name("test"))
     assert not is_finished(folder.path)
     scores = {"mIoU": 0.25, "Var": 2.5, "region/1": None}
-    folder.finish({"name": "a name", "dataset": "d", "val": {"mIoU": 0.5}, "test": scores})
+    folder.finish(
+        {"name": "a name", "key": "abc", "dataset": "d", "val": {"mIoU": 0.5}, "test": scores}
+    )
     return RunResult(folder.path)
 
 

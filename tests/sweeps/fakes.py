@@ -102,7 +102,7 @@ class PickyPlanner:
 
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:
     """One image of one region and two classes."""
-    array = np.array([[[[right, 1], [0, 4]]]])
+    array = np.array([[[[right, 4 - right], [0, 4]]]])
     named = {"names": ("00001D",), "night": None, "classes": ("road", "car")}
     return Counts(counts=array, **named, partition="ring1", dataset=dataset, split="test")
 

@@ -58,7 +58,7 @@ def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
             described = {"name": run.key, "tags": own, "params": {}}
             (folder / "run.json").write_text(json.dumps(described))
             replace(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
-            result = {"dataset": dataset, "test": {"mIoU": share / 100}}
+            result = {"key": run.key, "dataset": dataset, "test": {"mIoU": share / 100}}
             (folder / "result.json").write_text(json.dumps(result))
 
 

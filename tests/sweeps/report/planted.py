@@ -7,14 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from omegaconf import OmegaConf
 
+from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
 from sweeps.table_plan import make_request, row_digests
 from sweeps.worker.planner import Planner
+from tests.analysis.counts import result_of
 from tests.sweeps.verdicts.accuracies import accuracy
 
 PROVENANCE = {
@@ -29,6 +32,13 @@ PROVENANCE = {
     "cpu_usable": 2,
     "packages": {"torch": "2.0"},
 }
+
+
+def with_rings(counts: Counts) -> Counts:
+    """Counts of two regions as those of five rings, of which three have no pixel."""
+    empty = np.zeros_like(counts.counts, shape=(len(counts.names), 3, *counts.counts.shape[2:]))
+    both = np.concatenate([counts.counts, empty], 1)
+    return replace(counts, counts=both, partition="ring5")
 
 
 def plant(
@@ -50,9 +60,10 @@ def plant(
             folder.describe(describe(spec, request.tags([label])))
             folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
             folder.add_provenance(PROVENANCE)
-            counts = accuracy(percent, zlib.crc32(str(seed).encode()) % 97)
-            replace(counts, dataset="data", run=spec.key).save(folder.path / "counts_test.npz")
-            result = {"name": spec.name, "key": spec.key, "dataset": "data"}
+            counts = with_rings(accuracy(percent, zlib.crc32(str(seed).encode()) % 97))
+            counts = replace(counts, dataset="data", run=spec.key)
+            counts.save(folder.path / "counts_test.npz")
+            result = {"name": spec.name, **result_of(spec.key, counts)}
             folder.finish({**result, "seconds_of_last_process": 60.0 + seed})
             folders.append(folder.path)
     return folders
