@@ -47,13 +47,15 @@ class SamplerSource:
         trial = self.store.ask(self.settings.trials, self.space)
         if trial is None:
             return None
-        chosen, number = as_overrides(trial.params), trial.number
+        # A stored trial may have more parameters, which are not ours to compose.
+        params = {key: value for key, value in trial.params.items() if key in self.space}
+        chosen, number = as_overrides(params), trial.number
         study, replicates = self.store.study.study_name, self.settings.replicates
-        tags = {f"rgbt.study/{study}": str(number), VARIED: " ".join(trial.params)}
+        tags = {f"rgbt.study/{study}": str(number), VARIED: " ".join(params)}
         point = Point(
             label=f"#{number} " + " ".join(map(_short, chosen)),
             overrides=(*self.fixed, *chosen),
-            params=dict(trial.params),
+            params=params,
             tags=tags,
             seeds=tuple(range(replicates)) if replicates > 1 else (),
         )

@@ -49,6 +49,12 @@ def test_points_share_runs_of_equal_rows() -> None:
         "rgbt.table/own/t": "small | large",
         "rgbt.requested/own/t": "paper '' a.b=1",
     }
+    machine = replace(wanted(), extra=("dataset.root=/x", "a.b=1", "fresh=true"))
+    assert machine.tags(["small", "large"]) == points[0].tags
+    assert replace(wanted(), extra=(), form="released").tags(["small"]) == {
+        "rgbt.table/own/t": "small",
+        "rgbt.requested/own/t": "released ''",
+    }
     assert points[0].seeds == ()
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 

@@ -94,3 +94,19 @@ def test_pruning_callback_keeps_var_and_skips_two_objectives(tmp_path: Path) -> 
     assert desk.store.trials()[0].intermediate_values == {2: 9.0}
     both = search_desk(tmp_path, objectives=(Objective("val/mIoU", "maximize"), var), trials=1)
     assert taken(both).report is None
+
+
+def test_a_stored_parameter_outside_the_space_is_not_composed(tmp_path: Path) -> None:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution
+    from optuna.trial import TrialState, create_trial
+
+    desk = search_desk(tmp_path, trials=1)
+    stored = {"x": 0.5, "hydra.searchpath": "[pkg://evil]"}
+    kinds = {
+        "x": FloatDistribution(0, 1),
+        "hydra.searchpath": CategoricalDistribution(["[pkg://evil]"]),
+    }
+    waiting = create_trial(state=TrialState.WAITING, params=stored, distributions=kinds)
+    desk.store.study.add_trial(waiting)
+    point = taken(desk).plan.point
+    assert (point.overrides, dict(point.params)) == (("x=0.5",), {"x": 0.5})

@@ -1,0 +1,71 @@
+"""How runs were requested for a table, as their tags tell: never by composing their words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from analysis.results import finished_runs
+from rgbt.runs.folder import RunFolder, read_description
+from sweeps.table.request import REQUESTED
+from sweeps.table.table import Table, load_table
+from sweeps.verdicts.stored import FinishedRuns, TableResults, Variant
+from sweeps.worker.planner import Planner
+from tests.sweeps.report.planted import plant
+
+NAME, WORDS = "crm/table3a", ("optimizer.lr=-1", "masker=crm")
+SHARES = {"RGB": (50.0,), "CRM": (60.0,)}
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    rows = [row.label for row in load_table(NAME).runnable_rows][:2]
+    shares = dict(zip(rows, SHARES.values(), strict=True))
+    plant(tmp_path / "runs", NAME, shares, scale="bench")
+    plant(tmp_path / "runs", NAME, shares, *WORDS, scale="bench")
+    return tmp_path / "runs"
+
+
+def results(runs: Path, table: Table | None = None) -> TableResults:
+    finished = FinishedRuns(finished_runs(runs, runs / "none"))
+    planner = Planner((f"runs_dir={runs}",))
+    return TableResults(finished, planner, {NAME: table or load_table(NAME)}, 100)
+
+
+def test_runs_are_apart_by_the_words_that_were_typed(runs: Path) -> None:
+    found = results(runs)
+    assert {variant for _, variant in found.requested} == {
+        Variant("bench"),
+        Variant("bench", "paper", WORDS),
+    }
+    plain, other = list(found)
+    assert (plain.words, other.words) == ((), WORDS)
+    assert plain.runs.keys() == other.runs.keys()
+    assert len(other.runs) == 2
+    keys = {run.results[0].key for result in (plain, other) for run in result.runs.values()}
+    assert len(keys) == 4
+    assert found.remarks == []
+
+
+def test_a_row_that_is_another_one_today_has_no_run(runs: Path) -> None:
+    table = load_table(NAME)
+    first = table.runnable_rows[0]
+    changed = replace(first, overrides=(*first.overrides, "optimizer.lr=0.5"))
+    rows = tuple(changed if row is first else row for row in table.rows)
+    for result in results(runs, replace(table, rows=rows)):
+        assert {label for label, _ in result.runs} == {table.runnable_rows[1].label}
+
+
+@pytest.mark.parametrize("text", ["paper", "paper x hydra.run.dir=/a", "other x", "paper 'x"])
+def test_a_tag_that_no_request_has_is_a_remark(runs: Path, text: str) -> None:
+    path = next(path for path in sorted(runs.glob("*/run.json")) if REQUESTED in path.read_text())
+    known = read_description(path.parent)
+    assert known is not None
+    tags = {**known.tags, REQUESTED + NAME: text}
+    RunFolder(path.parent).describe(replace(known, tags=tags))
+    found = results(runs)
+    assert sorted(len(result.runs) for result in found) == [1, 2]
+    (remark,) = found.remarks
+    assert f"Run {path.parent.name} belongs to no table" in remark
