@@ -71,15 +71,21 @@ class PairReader:
             return Sample(rgb=pixels, thermal=levels, label=None, name=name)
         return self.sample(name, *self.whole(name, rgb, thermal), thermal)
 
-    def whole(self, name: str, rgb: Path, thermal: Path) -> tuple[Array, NDArray[Any]]:
-        """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`."""
+    def whole(
+        self, name: str, rgb: Path, thermal: Path, label_hw: tuple[int, ...] | None = None
+    ) -> tuple[Array, NDArray[Any]]:
+        """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`.
+
+        `label_hw`, of the label if there is one, decides which of two images is turned.
+        """
         if rgb == thermal:
             return read_packed(rgb, "give separate images of RGB and thermal")
         is_array = thermal.suffix.lower() == ".npy"
         pixels = read_rgb(rgb, self.advice)
         values = read_array(thermal, "numbers") if is_array else decode(thermal)
         values = self.check_values(values, thermal)
-        check_size(pixels.shape[:2], "thermal", values, name, thermal)
+        turned = rgb if label_hw and _is_upright(label_hw) == _is_upright(values.shape) else thermal
+        check_size(pixels.shape[:2], "thermal", values, name, thermal, turned)
         return pixels, values
 
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
@@ -138,16 +144,30 @@ class PairReader:
         return image[top:bottom, left:right]
 
 
-def check_size(
-    hw: tuple[int, ...], what: str, image: NDArray[Any], name: str, path: Path | None
+def check_size(  # noqa: PLR0913 - what a message says
+    hw: tuple[int, ...],
+    what: str,
+    image: NDArray[Any],
+    name: str,
+    path: Path | None,
+    turned: Path | None = None,
 ) -> None:
-    """Refuse an image (H', W') of `path` that is not of the size (H, W) of the RGB image."""
+    """Refuse an image (H', W') of `path` that is not of the size (H, W) of the RGB image.
+
+    Where one lies on its side, `turned` is that file; None: `path`.
+    """
     if image.shape != hw:
+        remedy = f"both must show the same pixels. Align them first: {path}."
+        if image.shape == hw[::-1]:
+            remedy = f"{turned or path} is turned by a quarter; turn it as the others are."
         raise InputError(
             f"'{name}': RGB is {hw[0]}x{hw[1]} pixels but {what} is "
-            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels. Align them "
-            f"first: {path}."
+            f"{image.shape[0]}x{image.shape[1]}; {remedy}"
         )
+
+
+def _is_upright(hw: tuple[int, ...]) -> bool:
+    return hw[0] > hw[1]
 
 
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:

@@ -48,7 +48,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
-        ("sizes", ", ".join(f"{name} {h}x{w}" for name, (h, w) in setup.sizes.items())),
+        ("sizes", ", ".join(f"{name} {text}" for name, text in setup.sizes.items())),
         *([("drawn", setup.rare.shares())] if setup.rare else []),
         ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
         ("folder", str(folder)),
