@@ -61,6 +61,7 @@ class TrainingSetup:
         model: the network as Fabric wrapped it.
         others: further networks that are trained, wrapped, by name.
         optimizers: by the names that the scheme's phases use.
+        absent: sentences about classes that no label of a split shows.
         rare: how images of the source are drawn by class; None: each once per epoch.
     """
 
@@ -73,6 +74,7 @@ class TrainingSetup:
     rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
+    absent: tuple[str, ...]
 
     @cached_property
     def steps_per_epoch(self) -> int:
@@ -211,7 +213,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         is_missing = bool(missing) and labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
     check_parts(session, names, masker, records)
-    _check_labels(session, names, is_reported=upstream_finished)
+    absent = _absent_classes(session, names)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -223,11 +225,11 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         session, built["optimizer"], fabric, records["scheme"]
     )
     parts = (session, fabric, datasets, model, others, optimizers, rare, scheme)
-    return TrainingSetup(*parts, built["schedule"])
+    return TrainingSetup(*parts, built["schedule"], absent)
 
 
-def _check_labels(session: Session, names: Lists, *, is_reported: bool) -> None:
-    """Refuse labels of one class beside a 255 that no setting ignores; report absent classes."""
+def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
+    """What labels of the splits do not show; InputError: one class beside a 255 that may be one."""
     dataset, reader = session.dataset, reader_of(session.dataset)
     unread = {each.split for each in session.domains.named.values() if each.labels != GIVEN}
     every = np.zeros(dataset.num_classes + 1, np.int64)
@@ -238,14 +240,15 @@ def _check_labels(session: Session, names: Lists, *, is_reported: bool) -> None:
         shown = zip(dataset.classes, pixels.tolist(), strict=False)
         absent = [name for name, number in shown if not number and name not in dataset.unscored]
         if absent and is_whole and pixels.any():
-            text = f"no label shows {', '.join(absent)}."
-            lines.setdefault(of_one_class(pixels, dataset.classes, None) or text, []).append(split)
+            text = (
+                of_one_class(pixels, dataset.classes, None) or f"no label shows {', '.join(absent)}"
+            )
+            lines.setdefault(text, []).append(split)
     codes = reader.codes if isinstance(reader, FileDataset) else None
     fault = of_one_class(every, dataset.classes, codes)
     if fault and codes is not None and codes.assumed and every[-1]:
-        raise InputError(f"{dataset.name}: {fault}")
-    for text, splits in lines.items() if is_reported else ():
-        info(f"{dataset.name} ({', '.join(splits)}): {text}")
+        raise InputError(f"{dataset.name}: {fault}.")
+    return tuple(f"{', '.join(splits)}: {text}" for text, splits in lines.items())
 
 
 def _shared_with_test(names: Lists, split: str) -> int:

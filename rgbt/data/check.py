@@ -162,7 +162,7 @@ def check_dataset(
     pixels = sum((each.pixels for each in splits.values()), np.zeros(1, np.int64))
     absent = [f"'{n}'" for n, p in zip(dataset.classes, pixels, strict=False) if not p]
     if alone := of_one_class(pixels, dataset.classes, dataset.codes):
-        problems.append(("", alone))
+        problems.append(("", f"{alone}."))
     elif absent and pixels.any():
         notes.append(("", f"no label shows {', '.join(absent)}; no score says anything about it."))
     notes += [("", text) for text in (*dataset.own_notes(lists), *_uneven(dataset, splits))]

@@ -41,6 +41,8 @@ TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+# Entries of a PNG that may hold an orientation.
+WITH_TAGS = ("exif", "Raw profile type exif", "XML:com.adobe.xmp")
 
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
@@ -135,8 +137,8 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             image, "tag_v2", {}
         )  # tags of a TIFF; the header of a PNG is its first chunk
         bits = data[24] if image.format == "PNG" else max(np.ravel(tags.get(258, 8)).tolist())
-        # A TIFF is turned by `load`.
-        turn = image.format != "TIFF" and TURNS.get(image.getexif().get(Base.Orientation, 1))
+        is_turned = image.format == "TIFF"  # by `load`
+        turn = None if is_turned else TURNS.get(image.getexif().get(Base.Orientation, 1))
     except UNREADABLE as error:
         is_other = isinstance(error, UnidentifiedImageError)  # whose message has an address
         reason = f"no {', '.join(FORMATS)}" if is_other else one_line(error)
@@ -148,7 +150,7 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             f"{path}: {image.mode} images of {bits} bits per channel are not read; save 8 bits per "
             "channel, or one channel of 16."
         )
-    if not turn:
+    if turn is None:
         return image, bits
     upright = image.transpose(turn)
     upright.format = image.format
@@ -164,7 +166,9 @@ def stored_hw(path: Path) -> tuple[int, int]:
         raise InputError(f"{path} is missing, or no regular file; {LEFT_OUT}.")
     try:
         with Image.open(path, formats=FORMATS) as image:
-            tags = image.getexif() if image.format != "TIFF" and "exif" in image.info else {}
+            # A TIFF has the size after turning; the tags of a PNG without these would decode it.
+            is_plain = image.format == "PNG" and image.info.keys().isdisjoint(WITH_TAGS)
+            tags = {} if is_plain or image.format == "TIFF" else image.getexif()
             is_turned = tags.get(Base.Orientation) in range(5, 9)
             width, height = image.size
     except UNREADABLE as error:

@@ -202,7 +202,7 @@ def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes 
         return ""
     only = f"'{classes[shown[0]]}' alone" if shown else "no class"
     if codes is None or not codes.assumed or not pixels[-1]:
-        return f"the labels show {only}; a score over one class is no score."
+        return f"the labels show {only}; a score over one class is no score"
     index = shown[0] if shown else 0
     other = 1 if index == 0 else 0
     value = next(value for value, each in codes.codes.items() if each == index)
@@ -211,4 +211,4 @@ def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes 
     if not codes.key:
         advice = "write the index of the class into the files if it is one"
     share = f"{pixels[-1] / pixels.sum():.1%}"
-    return f"the labels show {only} and {IGNORE} ({share} of the pixels, ignored); {advice}."
+    return f"the labels show {only} and {IGNORE} ({share} of the pixels, ignored); {advice}"

@@ -49,6 +49,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
         ("sizes", ", ".join(f"{name} {text}" for name, text in setup.sizes.items())),
+        *(("labels", text) for text in setup.absent),
         *([("drawn", setup.rare.shares())] if setup.rare else []),
         ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
         ("folder", str(folder)),

@@ -97,6 +97,8 @@ def test_check_notes_what_a_split_lacks(write_mfnet, png: Png) -> None:
             png(root / "labels" / f"{name}.png", label)
     end = ", which other splits have; a score of it says nothing about them."
     assert checked(root, *SPLITS).notes == (
+        "no label shows 'person', 'bike', 'curve', 'guardrail', 'color_cone'; no score says "
+        "anything about it.",
         f"split train has no 'unlabeled'{end}",
         f"split val has no 'unlabeled', 'bump'{end}",
         f"split test has no 'car_stop', 'bump'{end}",
