@@ -213,13 +213,13 @@ def _content_of(dataset: FileDataset, name: str) -> Content:
 
 def lonely_values(values: NDArray[Any]) -> list[float]:
     """The lowest and the highest value, if farther from all others than these from each other."""
-    found = []
-    for sign in (1, -1):
-        ordered = sign * values.astype(np.float64)
-        end = ordered.min()
-        others = ordered[ordered > end]
+    found, rest = [], values.astype(np.float64)
+    for sign in (1, -1, 1, -1):  # a second time without what was found
+        end = (sign * rest).min()
+        others = sign * rest[sign * rest > end]
         if others.size and others.min() - end > others.max() - others.min() > 0:
             found.append(float(sign * end))
+            rest = sign * others
     return found
 
 
