@@ -228,7 +228,9 @@ def test_thermal_without_data_is_reported(tmp_path: Path) -> None:
         "used as it is.",
     )
     write_any(tmp_path / "test" / "ir" / "1.tif", np.where(RAMP == 5, np.float32(np.nan), kelvin))
-    assert "1 thermal values are NaN or infinite" in check_dataset(own(tmp_path, **keys)).problems[0]
+    assert (
+        "1 thermal values are NaN or infinite" in check_dataset(own(tmp_path, **keys)).problems[0]
+    )
 
 
 def test_lonely_values_by_hand() -> None:
