@@ -199,7 +199,7 @@ def _mixed(contents: Mapping[str, Content]) -> Sentences:
 def _content_of(dataset: FileDataset, name: str) -> Content:
     """Read the files of a sample; InputError as of `FileDataset.read`."""
     whole = dataset.whole(name)
-    sample, values = dataset.made(name, whole), whole.thermal
+    sample, values = dataset.made(name, whole), whole[1]
     pixels = None if sample.label is None else label_pixels(sample.label, dataset.num_classes)
     kind = "float" if values.dtype.kind == "f" else str(values.dtype)
     is_constant = sample.thermal.min() == sample.thermal.max()

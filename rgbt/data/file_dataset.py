@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,7 @@ Lists = Mapping[str, str | tuple[str, ...]]
 # Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
 
-
-class Whole(NamedTuple):
-    """Content of the files of a sample: RGB (H, W, 3), thermal values and label (H, W)."""
-
-    rgb: NDArray[np.uint8]
-    thermal: NDArray[Any]
-    label: NDArray[np.uint8] | None
+Whole = tuple[NDArray[np.uint8], NDArray[Any], NDArray[np.uint8] | None]
 
 
 class FileDataset:
@@ -189,22 +183,21 @@ class FileDataset:
         return self.made(name, self.whole(name))
 
     def whole(self, name: str) -> Whole:
-        """What the files of `name` hold, before it becomes a sample; InputError as of `read`."""
+        """RGB (H, W, 3), thermal values and label (H, W) of the files; InputError as of `read`."""
         frame = self.frame(name)
         rgb, thermal = (within(path, self.root) for path in frame[2:4])
         label = self.codes.read(within(frame.label, self.root)) if frame.label else None
-        label_hw = None if label is None else label.shape
-        pixels, values = self.images.whole(name, rgb, thermal, label_hw)
-        return Whole(
-            pixels, values, None if label is None else self.fitted(label, frame, values.shape)
-        )
+        hw = None if label is None else label.shape
+        pixels, values = self.images.whole(name, rgb, thermal, hw)
+        label = None if label is None else self.fitted(label, frame, values.shape)
+        return pixels, values, label
 
     def made(self, name: str, whole: Whole) -> Sample:
-        """The sample of the content of its files; InputError as of `read`."""
-        label = whole.label
+        """The sample of what `whole` returns; InputError as of `read`."""
+        pixels, values, label = whole
         if label is not None:
             label = np.ascontiguousarray(self.images.cut(label, name))
-        sample = self.images.sample(name, whole.rgb, whole.thermal, self.frame(name).thermal)
+        sample = self.images.sample(name, pixels, values, self.frame(name).thermal)
         return replace(sample, label=label)
 
     def pair(self, name: str) -> Sample:

@@ -76,7 +76,7 @@ class PairReader:
     ) -> tuple[Array, NDArray[Any]]:
         """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`.
 
-        `label_hw`, of the label if there is one, decides which of two images is turned.
+        Of two sizes, that of the label, `label_hw`, is taken for the right one.
         """
         if rgb == thermal:
             return read_packed(rgb, "give separate images of RGB and thermal")
@@ -84,8 +84,8 @@ class PairReader:
         pixels = read_rgb(rgb, self.advice)
         values = read_array(thermal, "numbers") if is_array else decode(thermal)
         values = self.check_values(values, thermal)
-        turned = rgb if label_hw and _is_upright(label_hw) == _is_upright(values.shape) else thermal
-        check_size(pixels.shape[:2], "thermal", values, name, thermal, turned)
+        other = rgb if label_hw == values.shape else thermal
+        check_size(pixels.shape[:2], "thermal", values, name, other)
         return pixels, values
 
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
@@ -144,30 +144,18 @@ class PairReader:
         return image[top:bottom, left:right]
 
 
-def check_size(  # noqa: PLR0913 - what a message says
-    hw: tuple[int, ...],
-    what: str,
-    image: NDArray[Any],
-    name: str,
-    path: Path | None,
-    turned: Path | None = None,
+def check_size(
+    hw: tuple[int, ...], what: str, image: NDArray[Any], name: str, path: Path | None
 ) -> None:
-    """Refuse an image (H', W') of `path` that is not of the size (H, W) of the RGB image.
-
-    Where one lies on its side, `turned` is that file; None: `path`.
-    """
+    """Refuse an image (H', W') that is not of the size (H, W) of RGB; `path`: the file to mend."""
     if image.shape != hw:
         remedy = f"both must show the same pixels. Align them first: {path}."
         if image.shape == hw[::-1]:
-            remedy = f"{turned or path} is turned by a quarter; turn it as the others are."
+            remedy = f"{path} is turned by a quarter; turn it as the others are."
         raise InputError(
             f"'{name}': RGB is {hw[0]}x{hw[1]} pixels but {what} is "
             f"{image.shape[0]}x{image.shape[1]}; {remedy}"
         )
-
-
-def _is_upright(hw: tuple[int, ...]) -> bool:
-    return hw[0] > hw[1]
 
 
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:

@@ -186,9 +186,9 @@ class Trainer:
         if self.validate is not None:
             with at_once():
                 score = self.validate(state.step)
-            is_best, is_defined = score > state.best_score, not math.isnan(score)
-            keeps = is_best or self.settings.tested == "last" or not is_defined
-            state.best_score = score if keeps and is_defined else state.best_score
+            keeps = score > state.best_score or self.settings.tested == "last"
+            state.best_score = score if keeps else state.best_score
+            keeps |= math.isnan(score)
         if keeps:
             state.best_step = state.step
             self.keep()
