@@ -202,8 +202,11 @@ def _content_of(dataset: FileDataset, name: str) -> Content:
     sample, values = dataset.made(name, whole), whole[1]
     pixels = None if sample.label is None else label_pixels(sample.label, dataset.num_classes)
     kind = "float" if values.dtype.kind == "f" else str(values.dtype)
-    is_constant = sample.thermal.min() == sample.thermal.max()
-    problems = ["thermal is one grey level everywhere; replace the image."] if is_constant else []
+    problems = []
+    if sample.thermal.min() == sample.thermal.max():
+        is_flat = values.min() == values.max()
+        remedy = "replace the image" if is_flat else "see dataset.thermal_range"
+        problems = [f"thermal is one grey level everywhere; {remedy}."]
     notes = [
         f"thermal value {value:g} is far from all others (no data?), and used as it is."
         for value in (() if kind == "uint8" else lonely_values(values))

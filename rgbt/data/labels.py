@@ -78,12 +78,14 @@ class LabelCodes:
             values, counts = np.unique(raw[classes < 0], return_counts=True)
             code, count = int(values[counts.argmax()]), counts.max()
             shown = [code // 65536, code // 256 % 256, code % 256] if self.of_colours else code
-            is_own = self.key.startswith("dataset.")
-            advice = f"; add it there, or to dataset.ignored=[{shown}]" if is_own else ""
+            pair = f"CLASS: {shown}" if self.of_colours else f"{shown}: CLASS"
+            where, _, setting = self.key.partition(".")
+            is_own = where == "dataset"
+            advice = f"; in its YAML write {setting}: {{..., {pair}}}, or ignored: [{shown}]"
             raise InputError(
                 f"{path}: {'colour' if self.of_colours else 'label value'} {shown} ({count} pixels;"
                 f" one of {len(values)} unknown values) has no class in "
-                f"{self.key or 'this data set'} and is not ignored{advice}."
+                f"{self.key or 'this data set'} and is not ignored{advice if is_own else ''}."
             )
         return np.asarray(classes, np.uint8)
 

@@ -149,7 +149,7 @@ def own(root: Path, label: np.ndarray | None = None, **keys: Any) -> Folder:
         ((0, 255), {"ignored": (255,)}, "'ground' alone; a score over one class is no score."),
         ((0, 0), {}, "'ground' alone; a score over one class is no score."),
         ((0, 128), {}, "label value 128 (12 pixels; one of 1 unknown values) has no class in"),
-        ((0, 128), {}, "dataset.ids and is not ignored; add it there, or to dataset.ignored=[128]"),
+        ((0, 128), {}, "write ids: {..., 128: CLASS}, or ignored: [128]."),
         ((0, 255), {"ids": {0: "ground", 255: "object"}}, None),
         ((0, 128), {"ids": {0: "ground", 128: "object"}}, None),
     ],
@@ -212,7 +212,7 @@ def test_thermal_without_data_is_reported(tmp_path: Path) -> None:
     """Of real numbers, of sixteen bits, and one image of another type; one that shows nothing."""
     kelvin = 300 + RAMP.astype(np.float32) / 8
     hole = np.where(RAMP == 5, np.float32(-9999), kelvin)
-    images = {"train_1": hole, "train_2": hole, "val_1": kelvin, "val_2": kelvin + 200}
+    images = {"train_1": hole, "train_2": hole, "val_1": 0 * kelvin, "val_2": kelvin + 200}
     images |= {"test_1": kelvin, "test_2": 300 + RAMP.astype(np.uint16) // 8}
     for name, image in images.items():
         split, number = name.split("_")
@@ -220,7 +220,8 @@ def test_thermal_without_data_is_reported(tmp_path: Path) -> None:
     keys = {"thermal": "{split}/ir/{name}.tif", "thermal_range": (290, 310)}
     report = check_dataset(own(tmp_path, **keys))
     assert report.problems == (
-        "val_2: thermal is one grey level everywhere; replace the image.",
+        "val_1: thermal is one grey level everywhere; replace the image.",
+        "val_2: thermal is one grey level everywhere; see dataset.thermal_range.",
         "test_2: thermal is uint16, of most images float; store values of one type.",
     )
     assert report.notes == (
