@@ -103,7 +103,7 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
         (
             split,
             *map(str, (r.names, r.read, r.day, r.night, r.mirrored, r.unlabelled)),
-            ", ".join(f"{h}x{w} ({number})" for (h, w), number in sorted(r.sizes.items())),
+            _in_words(r.sizes),
         )
         for split, r in report.splits.items()
     ]
@@ -119,6 +119,14 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
     ]
     columns = ("class", *(f"{split} pixels (images)" for split in own))
     return TextTable("", header, tuple(rows)), TextTable("", columns, tuple(shares))
+
+
+def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
+    """Sizes with their number of images; of many, the smallest and the largest."""
+    texts = [f"{height}x{width} ({number})" for (height, width), number in sorted(sizes.items())]
+    if len(texts) > 3:
+        return f"{texts[0]} to {texts[-1]}, {len(texts)} sizes"
+    return ", ".join(texts)
 
 
 def check_dataset(
@@ -155,10 +163,8 @@ def check_dataset(
         problems.append((name.removeprefix(f"{dataset.root}/"), text))
     sizes = sorted(set().union(*(each.sizes for each in splits.values())))
     if len(sizes) > 1:
-        texts = ", ".join(f"{height}x{width}" for height, width in sizes)
-        notes.append(
-            ("", f"images differ in size ({texts}); evaluate with data.eval_batch_size=1.")
-        )
+        ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
+        notes.append(("", f"images differ in size ({ends}); evaluate with data.eval_batch_size=1."))
     pixels = sum((each.pixels for each in splits.values()), np.zeros(1, np.int64))
     absent = [f"'{n}'" for n, p in zip(dataset.classes, pixels, strict=False) if not p]
     if alone := of_one_class(pixels, dataset.classes, dataset.codes):

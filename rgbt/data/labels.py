@@ -175,14 +175,16 @@ def classes_in(
 ) -> tuple[PixelCounts, bool]:
     """`label_pixels` of the labels that were read, and whether these are all.
 
-    Reading stops when every class has a pixel, and after `MOST_LABELS` labels, evenly spread, when
-    two classes have. An unlabelled image has no pixel. InputError: a label cannot be read.
+    Reading stops when every scored class has a pixel, and after `MOST_LABELS` labels, evenly
+    spread, when two classes have. An unlabelled image has no pixel. InputError: an unreadable one.
     """
+    scored = [name not in dataset.unscored for name in dataset.classes]
     pixels = np.zeros(dataset.num_classes + 1, np.int64)
     spread = names[:: -(-len(names) // MOST_LABELS)]
     for number, name in enumerate((*spread, *sorted(set(names) - set(spread)))):
-        shown = np.count_nonzero(pixels[:-1])
-        if shown == dataset.num_classes or (shown > 1 and number >= len(spread)):
+        shown = pixels[:-1] > 0
+        is_several = shown.sum() > min(1, dataset.num_classes - 1)
+        if is_several and (shown[scored].all() or number >= len(spread)):
             return pixels, False
         try:
             label = dataset.label(name)

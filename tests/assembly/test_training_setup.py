@@ -287,13 +287,16 @@ def test_few_labels_are_read_for_their_classes(tmp_path: Path) -> None:
     read: list[str] = []
     labels = {f"{number:03}": np.full((1, 2), number == 250) for number in range(300)}
     dataset: Any = SimpleNamespace(
-        num_classes=2, label=lambda name: read.append(name) or labels[name].astype(np.uint8)
+        num_classes=2,
+        classes=("a", "b"),
+        unscored=(),
+        label=lambda name: read.append(name) or labels[name].astype(np.uint8),
     )
     pixels, is_whole = classes_in(dataset, tuple(labels), "raise")
     # Every third one, and then those of 0 to 250 that are no multiples of 3.
     assert (pixels.tolist(), is_whole) == ([2 * (100 + 166), 2, 0], False)
     assert (len(read), read[:3]) == (100 + 167, ["000", "003", "006"])
-    dataset.num_classes = 3
+    dataset.num_classes, dataset.classes = 3, ("a", "b", "c")
     labels["003"] = np.ones((1, 2))
     read.clear()
     assert classes_in(dataset, tuple(labels), "raise")[1] is False
@@ -301,3 +304,10 @@ def test_few_labels_are_read_for_their_classes(tmp_path: Path) -> None:
     read.clear()
     assert classes_in(dataset, tuple(labels)[:90], "raise")[1] is True
     assert len(read) == 90
+    dataset.unscored = ("c",)
+    assert classes_in(dataset, tuple(labels)[:90], "raise")[1] is False
+    assert read[90:] == ["000", "001", "002", "003"]
+    dataset.num_classes, dataset.classes, dataset.unscored = 1, ("a",), ()
+    del labels["003"], labels["250"], read[:]
+    assert classes_in(dataset, tuple(labels), "raise")[1] is False
+    assert read == ["000"]

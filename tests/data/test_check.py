@@ -92,6 +92,18 @@ def test_check_of_missing_and_shared_lists(write_mfnet) -> None:
     assert check_dataset(shared).problems == ()
 
 
+def test_check_shows_the_range_of_many_sizes(write_mfnet, capsys) -> None:
+    root = write_mfnet(SPLITS)
+    names = [f"{number:05d}D" for number in range(10, 15)]
+    for number, name in enumerate(names):
+        write_mfnet({"train": [name]}, (20 + number, 30))
+    (root / "train.txt").write_text("\n".join(names))
+    run(root)
+    out = capsys.readouterr().out
+    assert "20x30 (1) to 24x30 (1), 5 sizes" in out
+    assert "images differ in size (20x30 to 24x32); evaluate with data.eval_batch_size=1." in out
+
+
 def test_check_notes_what_a_split_lacks(write_mfnet, png: Png) -> None:
     root = write_mfnet(SPLITS)
     for split, names in SPLITS.items():
