@@ -19,11 +19,11 @@ from rgbt.dataset import LabelledDataset
 from rgbt.ranges import Colour
 from rgbt.types import IGNORE
 
-Array = NDArray[np.uint8]
-PixelCounts = NDArray[np.int64]
 # Labels of a split that are read to see which classes they show.
 MOST_LABELS = 100
 
+Array = NDArray[np.uint8]
+PixelCounts = NDArray[np.int64]
 LabelValue = Annotated[int, Interval(ge=-(2**31), lt=2**31)]
 Colours = Mapping[str, Colour | tuple[Colour, ...]]
 
@@ -36,7 +36,7 @@ class LabelCodes:
         codes: whole number -> class index, or 255; a colour is 65536 red + 256 green + blue.
         key: of the configuration that names the values; "" where they are fixed, and of 8 bits.
         of_colours: whether the files hold colours.
-        assumed: whether 255 is ignored by habit, not by a setting.
+        assumed: whether 255 is ignored by default, not by a setting.
     """
 
     codes: dict[int, int]
@@ -209,7 +209,7 @@ def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes 
         return f"the labels show {only}; a score over one class is no score"
     index = shown[0] if shown else 0
     other = 1 if index == 0 else 0
-    value = next(value for value, each in codes.codes.items() if each == index)
+    value = next((value for value, each in codes.codes.items() if each == index), index)
     ids = f"{{{value}: {classes[index]}, {IGNORE}: {classes[other]}}}"
     advice = f"in its YAML write ids: {ids} if it is a class, ignored: [{IGNORE}] if it is none"
     if not codes.key:

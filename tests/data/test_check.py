@@ -157,6 +157,7 @@ def own(root: Path, label: np.ndarray | None = None, **keys: Any) -> Folder:
         ((0, 255), {}, "write ids: {0: ground, 255: object} if it is a class, ignored: [255] if"),
         ((1, 255), {}, "write ids: {1: object, 255: ground} if it is a class"),
         ((255, 255), {}, "the labels show no class and 255 (100.0% of the pixels"),
+        ((255, 255), {"ids": {7: "object"}}, "write ids: {0: ground, 255: object} if it is a"),
         ((0, 255), {"ids": {0: "ground", 1: "object"}}, "'ground' alone and 255 (50.0% of the"),
         ((0, 255), {"ignored": (255,)}, "'ground' alone; a score over one class is no score."),
         ((0, 0), {}, "'ground' alone; a score over one class is no score."),
