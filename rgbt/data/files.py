@@ -44,6 +44,9 @@ TURNS = {
 # Entries of a PNG that may hold an orientation.
 WITH_TAGS = ("exif", "Raw profile type exif", "XML:com.adobe.xmp")
 
+# Bytes at the end of a PNG in which tags may follow the pixels.
+TAIL = 2**13
+
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
 # Exceptions of Pillow for damaged files.
@@ -158,21 +161,22 @@ def opened(path: Path) -> tuple[Image.Image, int]:
 
 
 def stored_hw(path: Path) -> tuple[int, int]:
-    """(height, width) of `opened`, read from the header alone; InputError if it has none.
-
-    An orientation behind the pixels of a PNG is not seen.
-    """
+    """(height, width) of `opened`, which reads little of the file; InputError as there."""
     if not path.is_file():
         raise InputError(f"{path} is missing, or no regular file; {LEFT_OUT}.")
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with path.open("rb") as file, Image.open(file, formats=FORMATS) as image:
             # A TIFF has the size after turning; the tags of a PNG without these would decode it.
             is_plain = image.format == "PNG" and image.info.keys().isdisjoint(WITH_TAGS)
             tags = {} if is_plain or image.format == "TIFF" else image.getexif()
             is_turned = tags.get(Base.Orientation) in range(5, 9)
             width, height = image.size
+            file.seek(-min(path.stat().st_size, TAIL), os.SEEK_END)
+            is_late = is_plain and b"eXIf" in file.read(TAIL)
     except UNREADABLE as error:
         raise InputError(f"{path} cannot be decoded ({one_line(error)}); {LEFT_OUT}.") from error
+    if is_late:
+        width, height = opened(path)[0].size
     return (width, height) if is_turned else (height, width)
 
 

@@ -267,6 +267,16 @@ def test_images_are_read_upright(
         np.testing.assert_array_equal(values_of(open_indices(path)), expected)
 
 
+def test_orientation_behind_the_pixels_of_a_png(path: Path) -> None:
+    """A quarter to the right (6), in the chunk before the last one."""
+    tags = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
+    rows = b"\0\1\2\3\0\4\5\6"
+    whole = png_bytes(3, 2, depth=8, colours=0, rows=rows)
+    path.write_bytes(whole[:-12] + chunk(b"eXIf", tags) + whole[-12:])
+    assert decode(path).tolist() == [[4, 1], [5, 2], [6, 3]]
+    assert stored_hw(path) == (3, 2)
+
+
 def test_headers_without_a_size_are_refused(tmp_path: Path) -> None:
     fifo, text = tmp_path / "fifo.png", tmp_path / "text.png"
     os.mkfifo(fifo)
