@@ -166,7 +166,8 @@ def check_dataset(
         ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
         notes.append(("", f"images differ in size ({ends}); evaluate with data.eval_batch_size=1."))
     pixels = sum((each.pixels for each in splits.values()), np.zeros(1, np.int64))
-    absent = [f"'{n}'" for n, p in zip(dataset.classes, pixels, strict=False) if not p]
+    shown = dict(zip(dataset.classes, pixels, strict=False))
+    absent = [f"'{n}'" for n in shown if not shown[n] and n not in dataset.unscored]
     if alone := of_one_class(pixels, dataset.classes, dataset.codes):
         problems.append(("", f"{alone}."))
     elif absent and pixels.any():
@@ -205,7 +206,7 @@ def _mixed(contents: Mapping[str, Content]) -> Sentences:
 def _content_of(dataset: FileDataset, name: str) -> Content:
     """Read the files of a sample; InputError as of `FileDataset.read`."""
     whole = dataset.whole(name)
-    sample, values = dataset.made(name, whole), whole[1]
+    sample, values = dataset.made(name, whole), dataset.images.cut(whole[1], name)
     pixels = None if sample.label is None else label_pixels(sample.label, dataset.num_classes)
     kind = "float" if values.dtype.kind == "f" else str(values.dtype)
     problems = []
