@@ -110,6 +110,27 @@ def test_smoke_runs_on_files_of_every_layout(call: Call, tmp_path: Path, dataset
 
 
 @pytest.mark.usefixtures("pictures")
+def test_labels_of_one_class_have_no_score(call: Call, tmp_path: Path) -> None:
+    """Said before the training and beside the tables; the last weights are tested."""
+    root = write_folder(tmp_path / "data")
+    for path in root.glob("*/mask/*.png"):
+        write_png(path, np.where(np.eye(6, 8) > 0, 255, 0).astype(np.uint8))
+    data = ("dataset=folder", f"dataset.root={root}", f"runs_dir={tmp_path / 'runs'}")
+    words = ("+experiment=grbm", "+debug=smoke", "masker.patch_size=32", *data, *OWN, *ON_CPU)
+    code, _, err = call(main, *words)
+    assert code == 2
+    assert_one_sentence(err, "write ids: {0: background, 255: person}")
+    code, out, err = call(main, *words, "dataset.ignored=[255]")
+    assert code == 0, err
+    assert "train, val, test: the labels show 'background' alone" in err
+    assert "labels of a single class in the test split: a mean over classes is undefined" in out
+    result = json.loads((only_run(tmp_path / "runs") / "result.json").read_text())
+    assert result["test"]["mIoU"] is None
+    assert result["test"]["class/background"] is not None
+    assert (result["best_step"], "best_score" in result) == (2, False)
+
+
+@pytest.mark.usefixtures("pictures")
 def test_finished_run_shows_its_tables_again(call: Call, data: Path, tmp_path: Path) -> None:
     words = (data, tmp_path, "+experiment=grbm", *short(1))
     code, out, err = train(call, *words)

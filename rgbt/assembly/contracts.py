@@ -215,8 +215,8 @@ class CheckedLoss:
 
 def check_parts(
     session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
-) -> dict[str, tuple[int, ...]]:
-    """Use a user's own parts, an author's network, masker and cameras once; sizes of an image."""
+) -> None:
+    """Use a user's own parts, an author's network, masker and cameras once."""
     transform, seed = session.transform, session.drawn.order
     check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
@@ -240,8 +240,6 @@ def check_parts(
                 camera.matrix(image_hw)
         except InputError as error:
             raise InputError(f"{node}.view.{error}") from error
-    predicted = tested.thermal.shape
-    return {"stored": shown.thermal.shape, "trained": example_hw, "predicted": predicted}
 
 
 def first_readable(session: Session, names: tuple[str, ...]) -> Sample:

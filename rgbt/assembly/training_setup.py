@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from types import SimpleNamespace
@@ -25,8 +26,10 @@ from rgbt.assembly.contracts import (
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
+from rgbt.data.file_dataset import FileDataset
+from rgbt.data.labels import classes_in, of_one_class
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
-from rgbt.dataset import LabelledDataset
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
 from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
@@ -34,14 +37,19 @@ from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
 from rgbt.processes import num_processes
-from rgbt.randomness import derive
+from rgbt.randomness import derive, numpy_generator
 from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import Loadable
+from rgbt.types import Loadable, Sample
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.rare_classes import RareClasses
+
+# Images of a split whose headers are read for the range of their sizes, in about 0.2 seconds.
+MOST_HEADERS = 1000
+
+Hw = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -53,8 +61,8 @@ class TrainingSetup:
         model: the network as Fabric wrapped it.
         others: further networks that are trained, wrapped, by name.
         optimizers: by the names that the scheme's phases use.
+        absent: sentences about classes that no label of a split shows.
         rare: how images of the source are drawn by class; None: each once per epoch.
-        sizes: height and width of the first image: "stored", "trained" and "predicted".
     """
 
     session: Session
@@ -66,13 +74,32 @@ class TrainingSetup:
     rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
-    sizes: Mapping[str, tuple[int, ...]]
+    absent: tuple[str, ...]
 
     @cached_property
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
         split = self.session.domains.source.split
         return steps_per_epoch(self.datasets["source"], self.session.loading, split)
+
+    @cached_property
+    def sizes(self) -> dict[str, str]:
+        """Of images as stored, trained and predicted: "480x640", "479x637 to 480x640".
+
+        Of files, the headers of `MOST_HEADERS` images of each split are read, evenly spread.
+        """
+        session, of_split = self.session, _stored_sizes(self.session)
+        train, test = of_split[session.domains.source.split], of_split["test"]
+        rng, transform = numpy_generator(session.drawn.order, "probe"), session.transform
+        trained = [transform.train(_black(hw), rng) for hw in (min(train), max(train))]
+        tested = [transform.test(_black(hw)) for hw in (min(test), max(test))]
+        is_part = max(map(len, session.names.values())) > MOST_HEADERS
+        some = f" (of {MOST_HEADERS} images a split)" if is_part else ""
+        return {
+            "stored": f"{_in_words(set[Hw]().union(*of_split.values()))}{some}",
+            "trained": _in_words({each.thermal.shape for each in trained}),
+            "predicted": _in_words({each.thermal.shape for each in tested}),
+        }
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
@@ -89,6 +116,31 @@ class TrainingSetup:
         second = train_batches(data, target.split, transform, loading, seed, steps, None)
         every = session.trainer.accumulate
         return PairedBatches(source, second, first=steps.start, per_step=every)
+
+
+def _stored_sizes(session: Session) -> dict[str, set[Hw]]:
+    """Sizes of the images of each split; of those that are no files, of the first one."""
+    reader = reader_of(session.dataset)
+    size_of = reader.stored_hw if isinstance(reader, FileDataset) else None
+    found: dict[str, set[Hw]] = {}
+    for split, names in session.names.items():
+        sizes = found[split] = set()
+        for name in names[:: -(-len(names) // MOST_HEADERS)]:
+            with suppress(InputError):  # the training reports what it cannot read
+                sizes |= {size_of(name)} if size_of else set()
+        if not sizes:
+            sizes.add(first_readable(session, names).thermal.shape)
+    return found
+
+
+def _in_words(sizes: Collection[Hw]) -> str:
+    ends = dict.fromkeys((min(sizes), max(sizes)))
+    return " to ".join("x".join(map(str, hw)) for hw in ends)
+
+
+def _black(hw: Hw) -> Sample:
+    plane = np.zeros(hw, np.uint8)
+    return Sample(rgb=np.dstack([plane] * 3), thermal=plane, label=plane, name="")
 
 
 def _class_pixels(session: Session, domain: Domain) -> NDArray[np.int64]:
@@ -160,7 +212,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = bool(missing) and labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    sizes = check_parts(session, names, masker, records)
+    check_parts(session, names, masker, records)
+    absent = _absent_classes(session, names)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -172,7 +225,30 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         session, built["optimizer"], fabric, records["scheme"]
     )
     parts = (session, fabric, datasets, model, others, optimizers, rare, scheme)
-    return TrainingSetup(*parts, built["schedule"], sizes)
+    return TrainingSetup(*parts, built["schedule"], absent)
+
+
+def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
+    """What labels of the splits do not show; InputError: one class beside a 255 that may be one."""
+    dataset, reader = session.dataset, reader_of(session.dataset)
+    unread = {each.split for each in session.domains.named.values() if each.labels != GIVEN}
+    every = np.zeros(dataset.num_classes + 1, np.int64)
+    lines: dict[str, list[str]] = {}
+    for split in [split for split in names if split == "test" or split not in unread]:
+        pixels, is_whole = classes_in(dataset, names[split], session.loading.on_error)
+        every += pixels
+        shown = zip(dataset.classes, pixels.tolist(), strict=False)
+        absent = [name for name, number in shown if not number and name not in dataset.unscored]
+        if absent and is_whole and pixels.any():
+            text = (
+                of_one_class(pixels, dataset.classes, None) or f"no label shows {', '.join(absent)}"
+            )
+            lines.setdefault(text, []).append(split)
+    codes = reader.codes if isinstance(reader, FileDataset) else None
+    fault = of_one_class(every, dataset.classes, codes)
+    if fault and codes is not None and codes.assumed and every[-1]:
+        raise InputError(f"{dataset.name}: {fault}.")
+    return tuple(f"{', '.join(splits)}: {text}" for text, splits in lines.items())
 
 
 def _shared_with_test(names: Lists, split: str) -> int:

@@ -38,7 +38,7 @@ class CachedDataset(DatasetWrapper):
         super().__init__(dataset)
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         self.folder = home / "rgbt/decoded" if folder == "auto" else Path(folder).expanduser()
-        settings = [type(dataset).__qualname__, dataset.name, dataset.decoding()]
+        settings = ["upright", type(dataset).__qualname__, dataset.name, dataset.decoding()]
         self._settings = json.dumps(settings, default=str)
 
     def read(self, name: str) -> Sample:

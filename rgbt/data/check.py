@@ -7,12 +7,16 @@ Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: probl
 
 from __future__ import annotations
 
-from collections import Counter
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
@@ -22,9 +26,16 @@ from rgbt.config.command import command
 from rgbt.config.component import build
 from rgbt.cores import usable_cores
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.labels import PixelCounts, label_pixels
+from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
+
+# Names of samples, "" where there is none, and what is said of each.
+Sentences = list[tuple[str, str]]
+
+# In sentences of one kind: values, which are kept, and paths and other numbers, which are not.
+VARYING = re.compile(r"((?:label|thermal) value -?[\d.e+-]+|colour \[[^]]*\])|\S*/\S*|\d+")
+OF_FILE = re.compile(r"'([^']+)'|(\S*/\S+)")
 
 
 @dataclass(frozen=True)
@@ -47,9 +58,19 @@ class SplitReport:
     images: PixelCounts
 
 
+class Content(NamedTuple):
+    """What the files of a sample hold; `pixels` as of `label_pixels`, None without a label."""
+
+    hw: tuple[int, ...]
+    pixels: PixelCounts | None
+    thermal: str  # type of the stored values: uint8, uint16, float
+    problems: list[str]
+    notes: list[str]
+
+
 @dataclass(frozen=True)
 class DatasetReport:
-    """A data set: its splits by name, and one sentence for each problem and each note."""
+    """A data set: its splits by name, and one sentence for each kind of problem and of note."""
 
     splits: dict[str, SplitReport]
     problems: tuple[str, ...]
@@ -82,7 +103,7 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
         (
             split,
             *map(str, (r.names, r.read, r.day, r.night, r.mirrored, r.unlabelled)),
-            ", ".join(f"{h}x{w} ({number})" for (h, w), number in sorted(r.sizes.items())),
+            _in_words(r.sizes),
         )
         for split, r in report.splits.items()
     ]
@@ -100,69 +121,156 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
     return TextTable("", header, tuple(rows)), TextTable("", columns, tuple(shares))
 
 
+def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
+    """Sizes with their number of images; of many, the smallest and the largest."""
+    texts = [f"{height}x{width} ({number})" for (height, width), number in sorted(sizes.items())]
+    if len(texts) > 3:
+        return f"{texts[0]} to {texts[-1]}, {len(texts)} sizes"
+    return ", ".join(texts)
+
+
 def check_dataset(
     dataset: FileDataset, *, num_threads: int = 4, is_shown: bool = False
 ) -> DatasetReport:
     """Read every sample of the splits, in threads, and report problems; progress goes to stderr."""
     lists: dict[str, tuple[str, ...]] = {}
-    problems: list[str] = []
-    notes: list[str] = []
+    problems: Sentences = []
+    notes: Sentences = []
     for split in dataset.splits:
         try:
             lists[split] = dataset.names(split)
         except InputError as error:
-            (notes if dataset.repeats(split) else problems).append(str(error))
-
-    def read(name: str) -> tuple[tuple[int, ...], PixelCounts | None] | str:
-        try:
-            sample = dataset.read(name)
-        except InputError as error:
-            return str(error)
-        label = sample.label
-        pixels = None if label is None else label_pixels(label, dataset.num_classes)
-        return sample.thermal.shape, pixels
-
-    every = tuple(dict.fromkeys(name for names in lists.values() for name in names))
-    contents: dict[str, tuple[tuple[int, ...], PixelCounts | None]] = {}
-    console = Console(stderr=True)
-    with ThreadPoolExecutor(num_threads) as pool:
-        results = pool.map(read, every)
-        shown = track(results, "reading", len(every), console=console, disable=not is_shown)
-        for name, found in zip(every, shown, strict=True):
-            if isinstance(found, str):
-                problems.append(found)
-            else:
-                contents[name] = found
-    splits = {}
-    for split, names in lists.items():
-        own = [contents[name] for name in dict.fromkeys(names) if name in contents]
-        labelled = [pixels for _, pixels in own if pixels is not None]
-        counts = np.array(labelled, np.int64).reshape(-1, dataset.num_classes + 1)
-        kinds = Counter(_kind_of(dataset, name) for name in names)
-        splits[split] = SplitReport(
-            names=len(names),
-            read=len(own),
-            unlabelled=len(own) - len(labelled),
-            day=kinds["day"],
-            night=kinds["night"],
-            mirrored=kinds["mirrored"],
-            sizes=dict(Counter(hw for hw, _ in own)),
-            pixels=counts.sum(0),
-            images=(counts > 0).sum(0),
-        )
+            (notes if dataset.repeats(split) else problems).append(("", str(error)))
+    names = tuple(dict.fromkeys(name for names in lists.values() for name in names))
+    contents: dict[str, Content] = {}
+    for name, found in zip(names, _read(dataset, names, num_threads, is_shown), strict=True):
+        if isinstance(found, str):
+            problems.append((name, found))
+        else:
+            contents[name] = found
+    problems += [(name, text) for name, each in contents.items() for text in each.problems]
+    problems += _mixed(contents)
+    notes += [(name, text) for name, each in contents.items() for text in each.notes]
+    splits = {split: _report(dataset, names, contents) for split, names in lists.items()}
     problems += _list_problems(dataset, lists)
     unused = sorted(dataset.unused(lists))
     if unused:
-        problems.append(
-            f"{len(unused)} files belong to no image of a split; the first is {unused[0]}."
-        )
-    problems += dataset.own_problems(lists)
+        text = f"{len(unused)} files belong to no image of a split; the first is {unused[0]}."
+        problems.append(("", text))
+    for text in dataset.own_problems(lists):
+        of_file = OF_FILE.search(text)
+        name = of_file[1] or of_file[2] if of_file else ""
+        problems.append((name.removeprefix(f"{dataset.root}/"), text))
     sizes = sorted(set().union(*(each.sizes for each in splits.values())))
     if len(sizes) > 1:
-        texts = ", ".join(f"{height}x{width}" for height, width in sizes)
-        notes.append(f"images differ in size ({texts}); evaluate with data.eval_batch_size=1.")
-    notes += [*dataset.own_notes(lists), *_uneven(dataset, splits)]
-    return DatasetReport(splits, tuple(problems), tuple(notes))
+        ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
+        notes.append(("", f"images differ in size ({ends}); evaluate with data.eval_batch_size=1."))
+    pixels = sum((each.pixels for each in splits.values()), np.zeros(1, np.int64))
+    shown = dict(zip(dataset.classes, pixels, strict=False))
+    absent = [f"'{n}'" for n in shown if not shown[n] and n not in dataset.unscored]
+    if alone := of_one_class(pixels, dataset.classes, dataset.codes):
+        problems.append(("", f"{alone}."))
+    elif absent and pixels.any():
+        notes.append(("", f"no label shows {', '.join(absent)}; no score says anything about it."))
+    notes += [("", text) for text in (*dataset.own_notes(lists), *_uneven(dataset, splits))]
+    return DatasetReport(splits, grouped(problems), grouped(notes))
+
+
+def _read(
+    dataset: FileDataset, names: Sequence[str], num_threads: int, is_shown: bool
+) -> Iterator[Content | str]:
+    """The content of every sample, or why it cannot be read, in order."""
+
+    def read(name: str) -> Content | str:
+        try:
+            return _content_of(dataset, name)
+        except InputError as error:
+            return str(error)
+
+    console = Console(stderr=True)
+    with ThreadPoolExecutor(num_threads) as pool:
+        results = pool.map(read, names)
+        yield from track(results, "reading", len(names), console=console, disable=not is_shown)
+
+
+def _mixed(contents: Mapping[str, Content]) -> Sentences:
+    """The images whose thermal values are stored with another type than those of most."""
+    kinds = [kind for kind, _ in Counter(each.thermal for each in contents.values()).most_common()]
+    return [
+        (name, f"thermal is {each.thermal}, of most images {kinds[0]}; store values of one type.")
+        for name, each in contents.items()
+        if each.thermal != kinds[0]
+    ]
+
+
+def _content_of(dataset: FileDataset, name: str) -> Content:
+    """Read the files of a sample; InputError as of `FileDataset.read`."""
+    whole = dataset.whole(name)
+    sample, values = dataset.made(name, whole), dataset.images.cut(whole[1], name)
+    pixels = None if sample.label is None else label_pixels(sample.label, dataset.num_classes)
+    kind = "float" if values.dtype.kind == "f" else str(values.dtype)
+    problems = []
+    if sample.thermal.min() == sample.thermal.max():
+        is_flat = values.min() == values.max()
+        remedy = "replace the image" if is_flat else "see dataset.thermal_range"
+        problems = [f"thermal is one grey level everywhere; {remedy}."]
+    notes = [
+        f"thermal value {value:g} is far from all others (no data?), and used as it is."
+        for value in (() if kind == "uint8" else lonely_values(values))
+    ]
+    return Content(sample.thermal.shape, pixels, kind, problems, notes)
+
+
+def lonely_values(values: NDArray[Any]) -> list[float]:
+    """The lowest and the highest value, if farther from all others than these from each other."""
+    found, rest = [], values.astype(np.float64)
+    for sign in (1, -1, 1, -1):  # a second time without what was found
+        end = (sign * rest).min()
+        others = sign * rest[sign * rest > end]
+        if others.size and others.min() - end > others.max() - others.min() > 0:
+            found.append(float(sign * end))
+            rest = sign * others
+    return found
+
+
+def _report(
+    dataset: FileDataset, names: Sequence[str], contents: Mapping[str, Content]
+) -> SplitReport:
+    own = [contents[name] for name in dict.fromkeys(names) if name in contents]
+    labelled = [each.pixels for each in own if each.pixels is not None]
+    counts = np.array(labelled, np.int64).reshape(-1, dataset.num_classes + 1)
+    kinds = Counter(_kind_of(dataset, name) for name in names)
+    return SplitReport(
+        names=len(names),
+        read=len(own),
+        unlabelled=len(own) - len(labelled),
+        day=kinds["day"],
+        night=kinds["night"],
+        mirrored=kinds["mirrored"],
+        sizes=dict(Counter(each.hw for each in own)),
+        pixels=counts.sum(0),
+        images=(counts > 0).sum(0),
+    )
+
+
+def grouped(found: Sentences) -> tuple[str, ...]:
+    """One sentence a kind: the first, after the number of images and the names of three.
+
+    Sentences of a kind differ in the name, in paths, and in numbers that are no values of images.
+    """
+    kinds: dict[str, Sentences] = defaultdict(list)
+    for name, text in found:
+        plain = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "", text) if name else text
+        kinds[VARYING.sub(lambda each: each[1] or "", plain)].append((name, text))
+    lines = []
+    for (name, text), *others in kinds.values():
+        names = ", ".join((name, *(other for other, _ in others[:2])))
+        more = ", ..." if len(others) > 2 else ""
+        before = f"{name}: " if name and name not in text else ""
+        lines.append(
+            f"{len(others) + 1} times ({names}{more}): {text}" if others else before + text
+        )
+    return tuple(lines)
 
 
 def _kind_of(dataset: FileDataset, name: str) -> str:
@@ -201,13 +309,13 @@ def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
     return notes
 
 
-def _list_problems(dataset: FileDataset, lists: SplitNames) -> list[str]:
+def _list_problems(dataset: FileDataset, lists: SplitNames) -> Sentences:
     """Names listed twice, of another time of day, mirrored for testing, or in two splits.
 
     Two splits may share names if one is a part of the other by name, as "test_day" is of "test",
     or if both are made of one source; of such splits the last is checked.
     """
-    problems = []
+    problems: Sentences = []
     of_source = {dataset.splits[split]: split for split in lists}
     lists = {split: lists[split] for split in of_source.values()}
     for split, names in lists.items():
@@ -215,20 +323,21 @@ def _list_problems(dataset: FileDataset, lists: SplitNames) -> list[str]:
         kinds = {name: _kind_of(dataset, name) for name in names}
         for name, count in Counter(names).items():
             if count > 1:
-                problems.append(f"split {split} lists '{name}' {count} times.")
+                problems.append((name, f"split {split} lists '{name}' {count} times."))
             if kinds[name] == other:
-                problems.append(f"split {split} lists '{name}', which is a {other} image.")
+                text = f"split {split} lists '{name}', which is a {other} image."
+                problems.append((name, text))
         flipped = [name for name in names if kinds[name] == "mirrored"]
         if flipped and "train" not in split:
-            problems.append(f"split {split} lists {len(flipped)} mirrored copies: '{flipped[0]}'.")
+            text = f"split {split} lists {len(flipped)} mirrored copies: '{flipped[0]}'."
+            problems.append(("", text))
     for one, other in combinations(lists, 2):
         words, other_words = set(one.split("_")), set(other.split("_"))
         is_part = words <= other_words or other_words <= words
         both = sorted(set(lists[one]) & set(lists[other]))
         if both and not is_part:
-            problems.append(
-                f"splits {one} and {other} share {len(both)} names; the first is '{both[0]}'."
-            )
+            text = f"splits {one} and {other} share {len(both)} names; the first is '{both[0]}'."
+            problems.append(("", text))
     return problems
 
 

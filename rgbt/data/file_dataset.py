@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.files import read_names, within
+from rgbt.data.files import read_names, stored_hw, within
 from rgbt.data.images import PairReader, Range, check_size
 from rgbt.data.labels import LabelCodes
 from rgbt.data.patterns import Frame, Patterns
@@ -25,6 +25,8 @@ Lists = Mapping[str, str | tuple[str, ...]]
 
 # Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
+
+Whole = tuple[NDArray[np.uint8], NDArray[Any], NDArray[np.uint8] | None]
 
 
 class FileDataset:
@@ -178,18 +180,36 @@ class FileDataset:
                 has other channels, bits or size than expected, or the label holds a value that has
                 no meaning.
         """
+        return self.made(name, self.whole(name))
+
+    def whole(self, name: str) -> Whole:
+        """RGB (H, W, 3), thermal values and label (H, W) of the files; InputError as of `read`."""
         frame = self.frame(name)
         rgb, thermal = (within(path, self.root) for path in frame[2:4])
-        pixels, values = self.images.whole(name, rgb, thermal)
         label = self.codes.read(within(frame.label, self.root)) if frame.label else None
+        hw = None if label is None else label.shape
+        pixels, values = self.images.whole(name, rgb, thermal, hw)
+        label = None if label is None else self.fitted(label, frame, values.shape)
+        return pixels, values, label
+
+    def made(self, name: str, whole: Whole) -> Sample:
+        """The sample of what `whole` returns; InputError as of `read`."""
+        pixels, values, label = whole
         if label is not None:
-            label = self.images.cut(self.fitted(label, frame, values.shape), name)
-            label = np.ascontiguousarray(label)
-        return replace(self.images.sample(name, pixels, values, thermal), label=label)
+            label = np.ascontiguousarray(self.images.cut(label, name))
+        sample = self.images.sample(name, pixels, values, self.frame(name).thermal)
+        return replace(sample, label=label)
 
     def pair(self, name: str) -> Sample:
         """The images of `read` alone, without the label; InputError as there."""
         return self.images.read(name, *(within(path, self.root) for path in self.frame(name)[2:4]))
+
+    def stored_hw(self, name: str) -> tuple[int, int]:
+        """(height, width) of `read`, by the header of the RGB image; InputError if it has none."""
+        if self.images.crop is None:
+            return stored_hw(within(self.frame(name).rgb, self.root))
+        top, bottom, left, right = self.images.crop
+        return bottom - top, right - left
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W) uint8, or None; InputError as there."""

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin, UnidentifiedImageError
+from PIL.ExifTags import Base
 
 from rgbt.checks import InputError, one_line
 
@@ -29,6 +30,22 @@ DEPTHS = {"1": 1, "L": 8, "P": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, 
 
 # Only libtiff refuses a damaged directory of a TIFF; Pillow warns, and reads the rest.
 TiffImagePlugin.READ_LIBTIFF = True
+
+# EXIF orientation -> how the stored rows and columns become those that every viewer shows.
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+# Entries of a PNG that may hold an orientation.
+WITH_TAGS = ("exif", "Raw profile type exif", "XML:com.adobe.xmp")
+
+# Bytes at the end of a PNG in which tags may follow the pixels.
+TAIL = 2**13
 
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
@@ -105,7 +122,7 @@ def _resolved(folder: str) -> str:
 
 
 def opened(path: Path) -> tuple[Image.Image, int]:
-    """A decoded image, and the bits per channel of its file.
+    """A decoded image, upright by its EXIF orientation, and the bits per channel of its file.
 
     The checksums of a PNG are compared. JPEG, TIFF and BMP have none: damage inside them is
     refused if the decoder fails, and otherwise changes pixels.
@@ -123,6 +140,8 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             image, "tag_v2", {}
         )  # tags of a TIFF; the header of a PNG is its first chunk
         bits = data[24] if image.format == "PNG" else max(np.ravel(tags.get(258, 8)).tolist())
+        is_turned = image.format == "TIFF"  # by `load`
+        turn = None if is_turned else TURNS.get(image.getexif().get(Base.Orientation, 1))
     except UNREADABLE as error:
         is_other = isinstance(error, UnidentifiedImageError)  # whose message has an address
         reason = f"no {', '.join(FORMATS)}" if is_other else one_line(error)
@@ -134,7 +153,31 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             f"{path}: {image.mode} images of {bits} bits per channel are not read; save 8 bits per "
             "channel, or one channel of 16."
         )
-    return image, bits
+    if turn is None:
+        return image, bits
+    upright = image.transpose(turn)
+    upright.format = image.format
+    return upright, bits
+
+
+def stored_hw(path: Path) -> tuple[int, int]:
+    """(height, width) of `opened`, which reads little of the file; InputError as there."""
+    if not path.is_file():
+        raise InputError(f"{path} is missing, or no regular file; {LEFT_OUT}.")
+    try:
+        with path.open("rb") as file, Image.open(file, formats=FORMATS) as image:
+            # A TIFF has the size after turning; the tags of a PNG without these would decode it.
+            is_plain = image.format == "PNG" and image.info.keys().isdisjoint(WITH_TAGS)
+            tags = {} if is_plain or image.format == "TIFF" else image.getexif()
+            is_turned = tags.get(Base.Orientation) in range(5, 9)
+            width, height = image.size
+            file.seek(-min(path.stat().st_size, TAIL), os.SEEK_END)
+            is_late = is_plain and b"eXIf" in file.read(TAIL)
+    except UNREADABLE as error:
+        raise InputError(f"{path} cannot be decoded ({one_line(error)}); {LEFT_OUT}.") from error
+    if is_late:
+        width, height = opened(path)[0].size
+    return (width, height) if is_turned else (height, width)
 
 
 def values_of(image: Image.Image) -> NDArray[Any]:

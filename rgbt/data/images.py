@@ -71,15 +71,21 @@ class PairReader:
             return Sample(rgb=pixels, thermal=levels, label=None, name=name)
         return self.sample(name, *self.whole(name, rgb, thermal), thermal)
 
-    def whole(self, name: str, rgb: Path, thermal: Path) -> tuple[Array, NDArray[Any]]:
-        """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`."""
+    def whole(
+        self, name: str, rgb: Path, thermal: Path, label_hw: tuple[int, ...] | None = None
+    ) -> tuple[Array, NDArray[Any]]:
+        """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`.
+
+        Of two sizes, that of the label, `label_hw`, is taken for the right one.
+        """
         if rgb == thermal:
             return read_packed(rgb, "give separate images of RGB and thermal")
         is_array = thermal.suffix.lower() == ".npy"
         pixels = read_rgb(rgb, self.advice)
         values = read_array(thermal, "numbers") if is_array else decode(thermal)
         values = self.check_values(values, thermal)
-        check_size(pixels.shape[:2], "thermal", values, name, thermal)
+        other = rgb if label_hw == values.shape else thermal
+        check_size(pixels.shape[:2], "thermal", values, name, other)
         return pixels, values
 
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
@@ -141,12 +147,14 @@ class PairReader:
 def check_size(
     hw: tuple[int, ...], what: str, image: NDArray[Any], name: str, path: Path | None
 ) -> None:
-    """Refuse an image (H', W') of `path` that is not of the size (H, W) of the RGB image."""
+    """Refuse an image (H', W') that is not of the size (H, W) of RGB; `path`: the file to mend."""
     if image.shape != hw:
+        remedy = f"both must show the same pixels. Align them first: {path}."
+        if image.shape == hw[::-1]:
+            remedy = f"{path} is turned by a quarter; turn it as the others are."
         raise InputError(
             f"'{name}': RGB is {hw[0]}x{hw[1]} pixels but {what} is "
-            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels. Align them "
-            f"first: {path}."
+            f"{image.shape[0]}x{image.shape[1]}; {remedy}"
         )
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import cv2
 import numpy as np
@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice
 from rgbt.data.files import open_indices, read_array, read_colours, values_of
+from rgbt.dataset import LabelledDataset
 from rgbt.ranges import Colour
 from rgbt.types import IGNORE
+
+# Labels of a split that are read to see which classes they show.
+MOST_LABELS = 100
 
 Array = NDArray[np.uint8]
 PixelCounts = NDArray[np.int64]
@@ -32,11 +36,13 @@ class LabelCodes:
         codes: whole number -> class index, or 255; a colour is 65536 red + 256 green + blue.
         key: of the configuration that names the values; "" where they are fixed, and of 8 bits.
         of_colours: whether the files hold colours.
+        assumed: whether 255 is ignored by default, not by a setting.
     """
 
     codes: dict[int, int]
     key: str = ""
     of_colours: bool = False
+    assumed: bool = False
 
     def read(self, path: Path) -> Array:
         """Class indices (H, W) uint8, 255 = ignored, of an image or a `.npy` file.
@@ -72,10 +78,14 @@ class LabelCodes:
             values, counts = np.unique(raw[classes < 0], return_counts=True)
             code, count = int(values[counts.argmax()]), counts.max()
             shown = [code // 65536, code // 256 % 256, code % 256] if self.of_colours else code
+            pair = f"CLASS: {shown}" if self.of_colours else f"{shown}: CLASS"
+            where, _, setting = self.key.partition(".")
+            is_own = where == "dataset"
+            advice = f"; in its YAML write {setting}: {{..., {pair}}}, or ignored: [{shown}]"
             raise InputError(
                 f"{path}: {'colour' if self.of_colours else 'label value'} {shown} ({count} pixels;"
                 f" one of {len(values)} unknown values) has no class in "
-                f"{self.key or 'this data set'} and is not ignored."
+                f"{self.key or 'this data set'} and is not ignored{advice if is_own else ''}."
             )
         return np.asarray(classes, np.uint8)
 
@@ -93,7 +103,7 @@ def code_of(colours: NDArray[Any]) -> NDArray[np.int64]:
 def indices(num_classes: int, *ignored: int) -> LabelCodes:
     """Values that are class indices; 255 and `ignored` do not count."""
     codes = {value: value for value in range(num_classes)}
-    return LabelCodes({**codes, **dict.fromkeys((*ignored, IGNORE), IGNORE)})
+    return LabelCodes({**codes, **dict.fromkeys((*ignored, IGNORE), IGNORE)}, assumed=True)
 
 
 def label_codes(
@@ -127,11 +137,12 @@ def label_codes(
         if code in codes:
             raise InputError(f"{key}: {value} occurs twice in the classes and dataset.ignored.")
         codes[code] = index
-    if colours is None:
-        codes.setdefault(IGNORE, IGNORE)
+    is_assumed = colours is None and IGNORE not in codes
+    if is_assumed:
+        codes[IGNORE] = IGNORE
     if not codes:
         raise InputError("dataset.colours: expected the colour of every class, got none.")
-    return LabelCodes(codes, key, of_colours=colours is not None)
+    return LabelCodes(codes, key, of_colours=colours is not None, assumed=is_assumed)
 
 
 def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
@@ -157,3 +168,51 @@ def label_pixels(label: Array, num_classes: int) -> PixelCounts:
     """(K + 1,) pixels of each class in a label (H, W); the last are ignored."""
     counts = np.bincount(label.ravel(), minlength=IGNORE + 1)
     return np.append(counts[:num_classes], counts[IGNORE])
+
+
+def classes_in(
+    dataset: LabelledDataset, names: Sequence[str], on_error: Literal["raise", "skip"]
+) -> tuple[PixelCounts, bool]:
+    """`label_pixels` of the labels that were read, and whether these are all.
+
+    Reading stops when every scored class has a pixel, and after `MOST_LABELS` labels, evenly
+    spread, when two classes have. An unlabelled image has no pixel. InputError: an unreadable one.
+    """
+    scored = [name not in dataset.unscored for name in dataset.classes]
+    pixels = np.zeros(dataset.num_classes + 1, np.int64)
+    spread = names[:: -(-len(names) // MOST_LABELS)]
+    for number, name in enumerate((*spread, *sorted(set(names) - set(spread)))):
+        shown = pixels[:-1] > 0
+        is_several = shown.sum() > min(1, dataset.num_classes - 1)
+        if is_several and (shown[scored].all() or number >= len(spread)):
+            return pixels, False
+        try:
+            label = dataset.label(name)
+        except InputError:
+            if on_error == "raise":
+                raise
+            label = None
+        pixels += 0 if label is None else label_pixels(label, dataset.num_classes)
+    return pixels, True
+
+
+def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes | None) -> str:
+    """A sentence where pixels (K + 1,) of labels are of one class of several, or none; else "".
+
+    With `codes`, it asks whether a value 255 that no setting ignores is another class.
+    """
+    shown = np.flatnonzero(pixels[:-1]).tolist()
+    if len(shown) > 1 or len(classes) < 2 or not pixels.any():
+        return ""
+    only = f"'{classes[shown[0]]}' alone" if shown else "no class"
+    if codes is None or not codes.assumed or not pixels[-1]:
+        return f"the labels show {only}; a score over one class is no score"
+    index = shown[0] if shown else 0
+    other = 1 if index == 0 else 0
+    value = next((value for value, each in codes.codes.items() if each == index), index)
+    ids = f"{{{value}: {classes[index]}, {IGNORE}: {classes[other]}}}"
+    advice = f"in its YAML write ids: {ids} if it is a class, ignored: [{IGNORE}] if it is none"
+    if not codes.key:
+        advice = "write the index of the class into the files if it is one"
+    share = f"{pixels[-1] / pixels.sum():.1%}"
+    return f"the labels show {only} and {IGNORE} ({share} of the pixels, ignored); {advice}"

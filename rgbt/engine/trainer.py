@@ -178,13 +178,17 @@ class Trainer:
             raise
 
     def _select(self, state: State) -> None:
-        """Evaluate, and keep the weights if they are the best so far or if the last are tested."""
+        """Evaluate, and keep the weights if they are the best so far or if the last are tested.
+
+        So are the last where the score is undefined (NaN), as of labels of one class.
+        """
         keeps = state.step == self.settings.max_steps
         if self.validate is not None:
             with at_once():
                 score = self.validate(state.step)
             keeps = score > state.best_score or self.settings.tested == "last"
             state.best_score = score if keeps else state.best_score
+            keeps |= math.isnan(score)
         if keeps:
             state.best_step = state.step
             self.keep()

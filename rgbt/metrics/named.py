@@ -20,10 +20,7 @@ from rgbt.metrics import names, pairs, scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import KINDS, DetailKind, details_of
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import MEANS, Matrices, Scores
-
-# Counts -> fractions (..., K).
-ByClass = Callable[[Matrices, Absent], Scores]
+from rgbt.metrics.scores import MEANS, ByClass, Matrices, Scores
 
 PAIR_SCORES: dict[str, ByClass] = {
     names.TC: pairs.tc,

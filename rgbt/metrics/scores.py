@@ -7,7 +7,8 @@ in squared percent points, as the papers print them.
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
                 and in the averages that the RTFNet and Temporal releases report.
-    "exclude":  NaN and is left out of means, as in the CMX release.
+    "exclude":  NaN and is left out of means, as in the CMX release. Where labels hold one scored
+                class of several, nothing is separated: a mean over classes is NaN as well.
 The denominator decides, by score and by region: IoU and F1 lack one where the class is neither
 labelled nor predicted, recall where it is not labelled, precision where it is not predicted. One
 false pixel of a class that no label holds makes its IoU 0 with either convention.
@@ -16,6 +17,7 @@ false pixel of a class that no label holds makes its IoU 0 with either conventio
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +30,7 @@ from rgbt.metrics.metric import Absent
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
 Scored = NDArray[np.bool_] | None  # (K,): which classes means are over; None: all
+ByClass = Callable[[Matrices, Absent], Scores]  # counts -> fractions (..., K)
 
 
 def iou(counts: Matrices, absent: Absent) -> Scores:
@@ -63,7 +66,20 @@ def class_mean(scores: Scores, scored: Scored = None) -> Scores:
 
 def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
     """Mean over the scored classes of `iou`; that of the tables is of the regions summed."""
-    return class_mean(iou(counts, absent), scored)
+    return _mean(iou, counts, absent, scored)
+
+
+def _mean(score: ByClass, counts: Matrices, absent: Absent, scored: Scored) -> Scores:
+    """Mean of a score over the scored classes; NaN where labels are of one class alone."""
+    is_alone = _is_alone(counts.sum(-1) > 0, scored, absent)
+    return np.where(is_alone, np.nan, class_mean(score(counts, absent), scored))
+
+
+def _is_alone(labelled: NDArray[np.bool_], scored: Scored, absent: Absent) -> NDArray[np.bool_]:
+    """Whether one of several scored classes is labelled, (..., K) -> (...), and others left out."""
+    labelled = labelled if scored is None else labelled[..., scored]
+    several = absent == "exclude" and labelled.shape[-1] > 1
+    return np.asarray((labelled.sum(-1) == 1) & several)
 
 
 def variance(region_scores: ArrayLike) -> Scores:
@@ -107,9 +123,9 @@ def object_recall(counts: Matrices) -> Scores:
 
 MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
     names.MIOU: miou,
-    names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
-    names.MPRECISION: lambda counts, absent, scored: class_mean(precision(counts, absent), scored),
-    names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
+    names.MACC: partial(_mean, recall),
+    names.MPRECISION: partial(_mean, precision),
+    names.MF1: partial(_mean, f1),
     names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
 }
 
@@ -152,7 +168,7 @@ def absent_notes(
     """Footnotes of a class table, from (R, K, K) counts: absent scored classes change the means.
 
     Classes that are neither labelled nor predicted, that are predicted only, and that some regions
-    lack.
+    lack; and where means are undefined.
     """
     counted = {"released": "counted as 0", "exclude": "left out of the mean"}[absent]
     labelled = by_region.sum(-1) > 0
@@ -168,7 +184,14 @@ def absent_notes(
         f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": unlabelled,
         f"absent from some regions: {{}}; {counted} there": lacks,
     }
-    return tuple(note.format(", ".join(each)) for note, each in named.items() if each)
+    notes = [note.format(", ".join(each)) for note, each in named.items() if each]
+    places = (labelled.any(0), *labelled)  # the whole image, then its regions
+    alone = [place for place, each in enumerate(places) if _is_alone(each, scored, absent)]
+    if alone:
+        where = ", ".join(f"region {place}" for place in alone)
+        where = f"the {split} split" if alone[0] == 0 else where
+        notes.append(f"labels of a single class in {where}: a mean over classes is undefined")
+    return tuple(notes)
 
 
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:

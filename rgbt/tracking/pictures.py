@@ -168,11 +168,12 @@ def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple
 def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
     """Ends of the colour scale in percent, equally far from the mean region.
 
-    At least `HALF_SPAN`, so that pictures of most runs can be compared.
+    At least `HALF_SPAN`, so that pictures of most runs can be compared. Without a score: around 50.
     """
     percents = 100.0 * np.asarray(ious, np.float64)
-    mean = float(np.nanmean(percents))
-    half = max(HALF_SPAN, float(np.nanmax(np.abs(percents - mean))))
+    known = percents[~np.isnan(percents)]
+    mean = float(known.mean()) if known.size else 50.0
+    half = max(HALF_SPAN, float(np.abs(known - mean).max(initial=0.0)))
     return mean - half, mean + half
 
 

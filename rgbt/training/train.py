@@ -176,7 +176,7 @@ class Training:
                 "dataset": fingerprint,
                 "steps": state.step,
                 "best_step": state.best_step,
-                **({"best_score": state.best_score} if session.selection_split else {}),
+                **({"best_score": state.best_score} if state.best_score >= 0 else {}),
                 "seconds_of_last_process": round(time.time() - started, 1),
                 "skipped": state.skipped,
                 **{kind: without_nan(values) for kind, values in reached.items()},

@@ -104,8 +104,8 @@ def test_intervals_hold_the_score(call: Call, data: Path, tmp_path: Path) -> Non
 
 def test_each_convention_has_separate_intervals() -> None:
     """A class that few images hold is absent from resamples: 0 pulls the mean down, exclude not."""
-    images = np.zeros((20, 2, 2, 2), np.int32)
-    images[:, :, 0, 0] = 10 + np.arange(20)[:, None]
+    images = np.zeros((20, 2, 3, 3), np.int32)
+    images[:, :, 0, 0] = images[:, :, 2, 2] = 10 + np.arange(20)[:, None]
     images[:, :, 0, 1] = np.arange(20)[:, None] % 3
     images[:2, 0, 1, 1] = 5
     images[:, 1, 0, 1] = 0  # the second class is nowhere in the second region
@@ -122,7 +122,7 @@ def test_each_convention_has_separate_intervals() -> None:
             assert interval is not None
             assert (score["low"], score["high"]) == (interval.low, interval.high)
             assert score["value"] == pytest.approx(expected[metric].value)
-    assert cells.loc["released", 2]["high"] <= 50
+    assert cells.loc["released", 2]["high"] <= 67
     assert cells.loc["exclude", 2]["low"] > 90
 
 

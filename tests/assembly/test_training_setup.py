@@ -12,18 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from rgbt.assembly import training_setup
 from rgbt.assembly.training_setup import set_up_training, validate
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data import rare_classes
+from rgbt.data.labels import classes_in
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.engine.device import Recomputed
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify
 from tests.commands import Call, assert_one_sentence
+from tests.conftest import write_png
+from tests.data import layouts
 
 SIZES = (
     *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
@@ -221,3 +225,89 @@ def test_seed_of_source_changes_only_its_own_draws(
         drawings = [both for both in zip(one, other, strict=True) if both[0].unique().numel() > 1]
         is_same = [torch.equal(*both) for both in drawings]
         assert not any(is_same) if index == changed else all(is_same)
+
+
+def own_data(root: Path, *more: str) -> RunSpec:
+    """A run on frames train_1, train_2, ... in the layout of `write_folder`."""
+    patterns = [f'dataset.{key}="{text}"' for key, text in layouts.PATTERNS.items()]
+    data = ["dataset=folder", f"dataset.root={root}", "dataset.thermal_range=[20000,24000]"]
+    words = [
+        "+experiment=mfnet",
+        "scale.batch_size=2",
+        *data,
+        "dataset.num_classes=3",
+        *SIZES[-3:],
+        *patterns,
+    ]
+    return specify(compose([*words, f"dataset.classes=[{','.join(layouts.CLASSES)}]", *more]))
+
+
+def test_sizes_are_from_smallest_to_largest(tmp_path: Path) -> None:
+    """Of all splits as stored, of the test images as predicted; by headers, EXIF included."""
+    root = layouts.write_folder(tmp_path / "data")
+    assert set_up_training(own_data(root)).sizes == {
+        "stored": "6x8",
+        "trained": "6x8",
+        "predicted": "6x8",
+    }
+    rgb, counts, label = layouts.of_folder("test_2", hw=(7, 9))
+    write_png(root / "test" / "mask" / "2.png", label)
+    layouts.write_any(root / "test" / "ir" / "2_ir.tif", counts)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored on its side
+    turned = Image.fromarray(np.ascontiguousarray(np.rot90(rgb)))
+    turned.save(root / "test" / "rgb" / "2.png", exif=exif)
+    setup = set_up_training(own_data(root))
+    assert setup.sizes == {
+        "stored": "6x8 to 7x9",
+        "trained": "6x8",
+        "predicted": "6x8 to 7x9",
+    }
+    assert np.array_equal(setup.session.dataset.read("test_2").rgb, rgb)
+
+
+def test_classes_that_no_label_shows_are_named(tmp_path: Path) -> None:
+    root = layouts.write_folder(tmp_path / "data")
+    assert set_up_training(own_data(root)).absent == ()
+    for path in (root / "test" / "mask").iterdir():
+        write_png(path, np.where(np.eye(6, 8) > 0, 1, 0).astype(np.uint8))
+    assert set_up_training(own_data(root)).absent == ("test: no label shows car",)
+    for path in root.glob("*/mask/*.png"):
+        write_png(path, np.where(np.eye(6, 8) > 0, 255, 0).astype(np.uint8))
+    text = "the labels show 'background' alone; a score over one class is no score"
+    assert set_up_training(own_data(root, "dataset.ignored=[255]")).absent == (
+        f"train, val, test: {text}",
+    )
+    with pytest.raises(InputError, match=r"write ids: \{0: background, 255: person\} if it is"):
+        set_up_training(own_data(root))
+
+
+def test_few_labels_are_read_for_their_classes(tmp_path: Path) -> None:
+    """Until every class is seen; at most so many, unless one class alone has been seen."""
+    read: list[str] = []
+    labels = {f"{number:03}": np.full((1, 2), number == 250) for number in range(300)}
+    dataset: Any = SimpleNamespace(
+        num_classes=2,
+        classes=("a", "b"),
+        unscored=(),
+        label=lambda name: read.append(name) or labels[name].astype(np.uint8),
+    )
+    pixels, is_whole = classes_in(dataset, tuple(labels), "raise")
+    # Every third one, and then those of 0 to 250 that are no multiples of 3.
+    assert (pixels.tolist(), is_whole) == ([2 * (100 + 166), 2, 0], False)
+    assert (len(read), read[:3]) == (100 + 167, ["000", "003", "006"])
+    dataset.num_classes, dataset.classes = 3, ("a", "b", "c")
+    labels["003"] = np.ones((1, 2))
+    read.clear()
+    assert classes_in(dataset, tuple(labels), "raise")[1] is False
+    assert len(read) == 100
+    read.clear()
+    assert classes_in(dataset, tuple(labels)[:90], "raise")[1] is True
+    assert len(read) == 90
+    dataset.unscored = ("c",)
+    assert classes_in(dataset, tuple(labels)[:90], "raise")[1] is False
+    assert read[90:] == ["000", "001", "002", "003"]
+    dataset.num_classes, dataset.classes, dataset.unscored = 1, ("a",), ()
+    del labels["003"], labels["250"], read[:]
+    assert classes_in(dataset, tuple(labels), "raise")[1] is False
+    assert read == ["000"]

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from omegaconf import OmegaConf
 
-from rgbt.data.check import DatasetReport, check_dataset, main
+from rgbt.data.check import DatasetReport, check_dataset, grouped, lonely_values, main
+from rgbt.data.folder import Folder
 from rgbt.data.mfnet import MFNet
+from tests.conftest import write_png
+from tests.data.layouts import write_any
 
 ROOT = Path(__file__).resolve().parents[2]
 SPLITS = {"train": ["00001D", "00002N"], "val": ["00003N", "00005D"], "test": ["00004D", "00006N"]}
@@ -87,6 +92,18 @@ def test_check_of_missing_and_shared_lists(write_mfnet) -> None:
     assert check_dataset(shared).problems == ()
 
 
+def test_check_shows_the_range_of_many_sizes(write_mfnet, capsys) -> None:
+    root = write_mfnet(SPLITS)
+    names = [f"{number:05d}D" for number in range(10, 15)]
+    for number, name in enumerate(names):
+        write_mfnet({"train": [name]}, (20 + number, 30))
+    (root / "train.txt").write_text("\n".join(names))
+    run(root)
+    out = capsys.readouterr().out
+    assert "20x30 (1) to 24x30 (1), 5 sizes" in out
+    assert "images differ in size (20x30 to 24x32); evaluate with data.eval_batch_size=1." in out
+
+
 def test_check_notes_what_a_split_lacks(write_mfnet, png: Png) -> None:
     root = write_mfnet(SPLITS)
     for split, names in SPLITS.items():
@@ -97,6 +114,8 @@ def test_check_notes_what_a_split_lacks(write_mfnet, png: Png) -> None:
             png(root / "labels" / f"{name}.png", label)
     end = ", which other splits have; a score of it says nothing about them."
     assert checked(root, *SPLITS).notes == (
+        "no label shows 'person', 'bike', 'curve', 'guardrail', 'color_cone'; no score says "
+        "anything about it.",
         f"split train has no 'unlabeled'{end}",
         f"split val has no 'unlabeled', 'bump'{end}",
         f"split test has no 'car_stop', 'bump'{end}",
@@ -114,3 +133,131 @@ def test_names_reach_the_terminal_without_control_characters(write_mfnet, capsys
     output = capsys.readouterr()
     assert "0?[2J1D" in output.out
     assert "\x1b[2J" not in output.out + output.err
+
+
+RAMP = np.arange(24, dtype=np.uint8).reshape(4, 6)
+
+
+def own(root: Path, label: np.ndarray | None = None, **keys: Any) -> Folder:
+    """Two images of each split, whose labels show both classes, or `label`."""
+    for split in ("train", "val", "test"):
+        for number in "12":
+            write_png(root / split / "rgb" / f"{number}.png", np.dstack([RAMP] * 3))
+            if not (root / split / "ir").is_dir() or "thermal" not in keys:
+                write_png(root / split / "ir" / f"{number}.png", RAMP)
+            write_png(root / split / "gt" / f"{number}.png", RAMP % 2 if label is None else label)
+    places = {key: f"{{split}}/{key}/{{name}}.png" for key in ("rgb", "ir", "gt")}
+    settings = {"rgb": places["rgb"], "thermal": places["ir"], "label": places["gt"], **keys}
+    return Folder(str(root), num_classes=2, classes=("ground", "object"), **settings)
+
+
+@pytest.mark.parametrize(
+    ("values", "keys", "said"),
+    [
+        ((0, 255), {}, "write ids: {0: ground, 255: object} if it is a class, ignored: [255] if"),
+        ((1, 255), {}, "write ids: {1: object, 255: ground} if it is a class"),
+        ((255, 255), {}, "the labels show no class and 255 (100.0% of the pixels"),
+        ((255, 255), {"ids": {7: "object"}}, "write ids: {0: ground, 255: object} if it is a"),
+        ((0, 255), {"ids": {0: "ground", 1: "object"}}, "'ground' alone and 255 (50.0% of the"),
+        ((0, 255), {"ignored": (255,)}, "'ground' alone; a score over one class is no score."),
+        ((0, 0), {}, "'ground' alone; a score over one class is no score."),
+        ((0, 128), {}, "label value 128 (12 pixels; one of 1 unknown values) has no class in"),
+        ((0, 128), {}, "write ids: {..., 128: CLASS}, or ignored: [128]."),
+        ((0, 255), {"ids": {0: "ground", 255: "object"}}, None),
+        ((0, 128), {"ids": {0: "ground", 128: "object"}}, None),
+    ],
+)
+def test_masks_of_one_class_are_a_problem(
+    tmp_path: Path, values: tuple[int, int], keys: dict[str, Any], said: str | None
+) -> None:
+    """255 is no class and ignored by nothing but habit, unless the data set says what it is."""
+    dataset = own(tmp_path, np.where(RAMP % 2, *values[::-1]).astype(np.uint8), **keys)
+    report = check_dataset(dataset)
+    if said is None:
+        assert report.problems == ()
+        assert report.splits["test"].pixels.tolist() == [24, 24, 0]
+    else:
+        assert len(report.problems) == 1
+        assert said in report.problems[0]
+
+
+def test_255_is_ignored_beside_other_classes(tmp_path: Path, write_mfnet, png: Png) -> None:
+    label = RAMP % 2
+    label[0] = 255
+    report = check_dataset(own(tmp_path, label))
+    assert (report.problems, report.notes) == ((), ())
+    assert report.splits["test"].pixels.tolist() == [18, 18, 12]
+    # A reader whose values are fixed has no setting for them.
+    root = write_mfnet(SPLITS)
+    for path in (root / "labels").iterdir():
+        png(path, np.where(np.eye(24, 32) > 0, 255, 0).astype(np.uint8))
+    (problem,) = checked(root, *SPLITS).problems
+    assert "'unlabeled' alone and 255 (3.1% of the pixels, ignored); write the index" in problem
+
+
+def test_problems_of_one_kind_are_one_line(tmp_path: Path) -> None:
+    dataset = own(tmp_path)
+    for split in ("train", "test"):
+        for number in "12":
+            (tmp_path / split / "ir" / f"{number}.png").unlink()
+    write_png(tmp_path / "val" / "gt" / "1.png", np.full((4, 6), 7, np.uint8))
+    write_png(tmp_path / "val" / "gt" / "2.png", np.full((4, 6), 8, np.uint8))
+    first, *others = check_dataset(dataset).problems
+    gone = tmp_path / "train" / "ir" / "1.png"
+    assert first.startswith(f"4 times (train_1, train_2, test_1, ...): {gone} is missing")
+    # The value is what is wrong, not a number that differs from image to image.
+    assert [value in line for value, line in zip("78", others, strict=True)] == [True, True]
+    said = [("1", "/a/1.png has 31 pixels."), ("3", "/a/3.png has 3 pixels."), ("3", "flat")]
+    assert grouped(said) == ("2 times (1, 3): /a/1.png has 31 pixels.", "3: flat")
+
+
+@pytest.mark.parametrize("turned", ["rgb", "ir", "gt"])
+def test_the_turned_one_of_three_files_is_named(tmp_path: Path, turned: str) -> None:
+    dataset = own(tmp_path)
+    path = tmp_path / "val" / turned / "2.png"
+    write_png(path, np.dstack([RAMP.T] * 3) if turned == "rgb" else RAMP.T % 2)
+    (problem,) = check_dataset(dataset).problems
+    assert problem.startswith("'val_2': RGB is ")
+    assert problem.endswith(f"; {path} is turned by a quarter; turn it as the others are.")
+
+
+def test_thermal_without_data_is_reported(tmp_path: Path) -> None:
+    """Of real numbers, of sixteen bits, and one image of another type; one that shows nothing."""
+    kelvin = 300 + RAMP.astype(np.float32) / 8
+    hole = np.where(RAMP == 5, np.float32(-9999), kelvin)
+    images = {"train_1": hole, "train_2": hole, "val_1": 0 * kelvin, "val_2": kelvin + 200}
+    images |= {"test_1": kelvin, "test_2": 300 + RAMP.astype(np.uint16) // 8}
+    for name, image in images.items():
+        split, number = name.split("_")
+        write_any(tmp_path / split / "ir" / f"{number}.tif", image)
+    keys = {"thermal": "{split}/ir/{name}.tif", "thermal_range": (290, 310)}
+    report = check_dataset(own(tmp_path, **keys))
+    assert report.problems == (
+        "val_1: thermal is one grey level everywhere; replace the image.",
+        "val_2: thermal is one grey level everywhere; see dataset.thermal_range.",
+        "test_2: thermal is uint16, of most images float; store values of one type.",
+    )
+    assert report.notes == (
+        "2 times (train_1, train_2): thermal value -9999 is far from all others (no data?), and "
+        "used as it is.",
+    )
+    write_any(tmp_path / "test" / "ir" / "1.tif", np.where(RAMP == 5, np.float32(np.nan), kelvin))
+    assert (
+        "1 thermal values are NaN or infinite" in check_dataset(own(tmp_path, **keys)).problems[0]
+    )
+
+
+def test_lonely_values_by_hand() -> None:
+    """0 is 21000 away from all others, which are at most 2900 from each other."""
+    counts = list(range(21000, 24000, 100))
+    for values, expected in (
+        ([0, *counts], [0]),
+        ([*counts, 65535], [65535]),
+        ([-32768, -9999, *range(20, 40)], [-32768, -9999]),
+        ([0, *counts, 65535], [65535, 0]),
+        ([18200, *counts], []),  # 2800 away
+        (counts, []),
+        ([7, 7, 7], []),
+        ([0, 9], []),
+    ):
+        assert lonely_values(np.array(values)) == expected

@@ -32,7 +32,9 @@ def write(path: Path, values: np.ndarray[Any, Any]) -> None:
 
 def write_pair(rgb: Path, thermal: Path, label: Path, value: int) -> None:
     write(rgb, np.full((*HW, 3), value, np.uint8))
-    write(thermal, np.full(HW, value, np.uint16 if thermal.suffix == ".tiff" else np.uint8))
+    counts = np.full(HW, value, np.uint16 if thermal.suffix == ".tiff" else np.uint8)
+    counts[-1] = range(100, 100 + 20 * HW[1], 20)
+    write(thermal, counts)
     write(label, np.full(HW, value, np.uint8))
 
 

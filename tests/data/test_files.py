@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from rgbt.data.files import (
     decode,
@@ -19,6 +22,7 @@ from rgbt.data.files import (
     read_names,
     read_packed,
     read_rgb,
+    stored_hw,
     values_of,
     within,
 )
@@ -210,3 +214,75 @@ def test_lists(tmp_path: Path) -> None:
     path.unlink()
     said = layouts.refused(lambda: read_names(path, "dataset.splits.train"))
     assert said.startswith(f"dataset.splits.train: {path} is missing")
+
+
+# What a viewer shows of the stored rows "abc" and "def", by EXIF orientation (EXIF 2.3, 4.6.4).
+SHOWN = {
+    1: ("abc", "def"),
+    2: ("cba", "fed"),
+    3: ("fed", "cba"),
+    4: ("def", "abc"),
+    5: ("ad", "be", "cf"),
+    6: ("da", "eb", "fc"),
+    7: ("fc", "eb", "da"),
+    8: ("cf", "be", "ad"),
+}
+
+
+@pytest.mark.parametrize("orientation", SHOWN)
+@pytest.mark.parametrize(
+    ("kind", "depth", "options"),
+    [
+        *(("png", depth, {}) for depth in ("u1", "u2", "3u1")),
+        *(("jpg", depth, {"quality": 100, "subsampling": 0}) for depth in ("u1", "3u1")),
+        *(
+            ("tif", depth, {"compression": method})
+            for depth in ("u1", "u2", "f4", "3u1")
+            for method in (None, "tiff_lzw")
+        ),
+    ],
+)
+def test_images_are_read_upright(
+    tmp_path: Path, kind: str, depth: str, options: dict[str, Any], orientation: int
+) -> None:
+    """Of every format and depth, grey or of three channels; the header has the size of it."""
+    level = {letter: 40 * n for n, letter in enumerate("abcdef")}
+    side = 16 if kind == "jpg" else 1  # a block of JPEG keeps its grey level
+
+    def image_of(rows: Sequence[str]) -> np.ndarray:
+        plane = np.array([[level[each] for each in row] for row in rows]).astype(depth[-2:])
+        plane = plane.repeat(side, 0).repeat(side, 1)
+        return np.dstack([plane] * 3) if depth == "3u1" else plane
+
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"x.{kind}"
+    Image.fromarray(image_of(("abc", "def"))).save(path, exif=exif, **options)
+    expected, found = image_of(SHOWN[orientation]), decode(path)
+    assert found.dtype == np.dtype(depth[-2:])
+    np.testing.assert_allclose(found, expected, atol=1 if kind == "jpg" else 0)
+    assert stored_hw(path) == expected.shape[:2]
+    if kind == "png" and depth != "3u1":
+        np.testing.assert_array_equal(values_of(open_indices(path)), expected)
+
+
+def test_orientation_behind_the_pixels_of_a_png(path: Path) -> None:
+    """A quarter to the right (6), in the chunk before the last one."""
+    tags = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
+    rows = b"\0\1\2\3\0\4\5\6"
+    whole = png_bytes(3, 2, depth=8, colours=0, rows=rows)
+    path.write_bytes(whole[:-12] + chunk(b"eXIf", tags) + whole[-12:])
+    assert decode(path).tolist() == [[4, 1], [5, 2], [6, 3]]
+    assert stored_hw(path) == (3, 2)
+
+
+def test_headers_without_a_size_are_refused(tmp_path: Path) -> None:
+    fifo, text = tmp_path / "fifo.png", tmp_path / "text.png"
+    os.mkfifo(fifo)
+    text.write_text("no image")
+    for path, said in (
+        (tmp_path / "gone.png", "is missing"),
+        (fifo, "no regular file"),
+        (text, "cannot be decoded"),
+    ):
+        assert said in refused(path, stored_hw)

@@ -203,7 +203,8 @@ def test_all_in_one_folder(tmp_path: Path) -> None:
     for name in ("train_9", "train_10", "val_1", "test_1"):
         write_png(tmp_path / f"{name}.png", np.zeros((*HW, 3), np.uint8))
         for kind in ("ir", "mask"):
-            write_png(tmp_path / f"{name}_{kind}.png", np.zeros(HW, np.uint8))
+            image = np.arange(48, dtype=np.uint8).reshape(HW) % 3
+            write_png(tmp_path / f"{name}_{kind}.png", image)
     dataset = folder(
         tmp_path,
         rgb="{split}_{name}.png",

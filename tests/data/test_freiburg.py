@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -187,6 +188,19 @@ def test_sequences_that_are_held_out(sound: Path, tmp_path: Path) -> None:
     write_training(tmp_path, "seq_04_day/00", "1_0")
     for split in ("train_night", "test", "train"):
         assert not freiburg(tmp_path).has(split)
+
+
+def test_check_leaves_out_what_the_crop_cuts_off(tmp_path: Path) -> None:
+    """The black margins of aligned thermal images are no missing data, if nobody sees them."""
+    root = write_freiburg(tmp_path)
+    for path in root.rglob("*_ir*.png"):
+        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        kept = counts[slice(*CROP[:2]), slice(*CROP[2:])].copy()
+        counts[:] = 0
+        counts[slice(*CROP[:2]), slice(*CROP[2:])] = kept
+        write_png(path, counts)
+    assert "no data" not in " ".join(check_dataset(freiburg(root)).notes)
+    assert "value 0 is far" in " ".join(check_dataset(freiburg(root, crop=None)).notes)
 
 
 def test_folders_in_other_capitals_and_without_a_time(tmp_path: Path) -> None:

@@ -53,6 +53,21 @@ def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path) -> None:
     assert np.array_equal(seen.thermal, expected.thermal), "grey levels are neither cut nor scaled"
 
 
+def test_both_images_of_a_pair_are_turned_by_their_own_orientation(tmp_path: Path) -> None:
+    """RGB was stored upside down (3), thermal on its side (8: a quarter to the left)."""
+    rgb, thermal = tmp_path / "rgb" / "1.png", tmp_path / "thermal" / "1.png"
+    stored = {rgb: (RGB[::-1, ::-1], 3), thermal: (np.rot90(GREY, -1), 8)}
+    for path, (image, orientation) in stored.items():
+        path.parent.mkdir()
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.fromarray(np.ascontiguousarray(image)).save(path, exif=exif)
+    found = of_path(Reading(), str(tmp_path), "raise")
+    (sample,) = found.samples("raise")
+    assert np.array_equal(sample.rgb, RGB)
+    assert np.array_equal(sample.thermal, GREY)
+
+
 def test_arrays_of_unclear_or_wrong_values_are_refused() -> None:
     low = Reading(*FREIBURG, thermal_range=(0, 200))
     said = refused(lambda: of_arrays(low, RGB, GREY))

@@ -125,7 +125,10 @@ def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     # Its other frames are two apart, those of the other video one.
     said = refused(lambda: video(root).sequences("test"))
     assert "video 'x' lacks frame 2, which should follow 'x_1'" in said
-    assert f"{root}/x/ir/2.png has no RGB image." in check_dataset(video(root)).problems
+    assert (
+        f"2 times (x/ir/2.png, x/label/2.png): {root}/x/ir/2.png has no RGB image."
+        in check_dataset(video(root)).problems
+    )
 
 
 # Sequences.

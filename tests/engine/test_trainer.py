@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
@@ -227,12 +228,17 @@ def test_resume_equals_straight_through(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("tested", "scores", "kept"),
-    [("best", {3: 0.9, 6: 0.1}, 3), ("last", {3: 0.9, 6: 0.1}, 6), ("last", None, 6)],
+    [
+        ("best", {3: 0.9, 6: 0.1}, 3),
+        ("best", {3: math.nan, 6: math.nan}, 6),
+        ("last", {3: 0.9, 6: 0.1}, 6),
+        ("last", None, 6),
+    ],
 )
 def test_which_checkpoint_is_tested(
     tmp_path: Path, tested: str, scores: dict[int, float] | None, kept: int
 ) -> None:
-    """Without a selection split, the last weights are the best, and none before."""
+    """Without a selection split or a score, the last weights are the best."""
     trainer, _ = make(tmp_path, tested=tested)
     trainer.validate = None if scores is None else scores.__getitem__
     written: list[bool] = []
@@ -240,11 +246,12 @@ def test_which_checkpoint_is_tested(
     state = State(seed=0)
     trainer.fit(batches(0), state)
     best = load_checkpoint(tmp_path / "best.pt")
-    expected = (kept, kept, -1.0 if scores is None else scores[kept], 6)
+    is_scored = scores is not None and not math.isnan(scores[kept])
+    expected = (kept, kept, scores[kept] if is_scored else -1.0, 6)
     assert (best["step"], state.best_step, state.best_score, state.evaluated_step) == expected
     assert written == [False] * 3 + [scores is not None] * 3
     last = load_checkpoint(tmp_path / "last.pt")
-    assert same(dict(last["model"]), dict(best["model"])) == (tested == "last")
+    assert same(dict(last["model"]), dict(best["model"])) == (kept == 6)
 
 
 @pytest.mark.parametrize("clear", [True, False])

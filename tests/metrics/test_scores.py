@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -146,3 +147,29 @@ def test_means_by_hand(absent: Any) -> None:
     )
     expected = np.var(ious) if absent == "released" else spread
     assert value("Var", counts, absent) == pytest.approx(expected)
+
+
+def test_means_over_one_labelled_class_are_undefined() -> None:
+    """Whatever is predicted; the scores of the class itself, and the released rule, stay."""
+    alone = [[6, 2, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 3]]  # road, and void is unscored
+    counts = counts_of(alone, RIGHT)
+    of_road = counts_of(alone, alone)
+    for metric in ("mIoU", "mAcc", "mPrecision", "mF1", "region/1", "Var"):
+        assert np.isnan(value(metric, of_road, "exclude")), metric
+        assert not np.isnan(value(metric, of_road, "released")), metric
+    assert value("class/road", of_road, "exclude") == pytest.approx(100 * 6 / 9)
+    assert value("mIoU", of_road, "released") == pytest.approx(100 * (6 / 9 + 0 + 0) / 3)
+    # One region is undefined, and left out of the variance.
+    assert np.isnan(value("region/1", counts, "exclude"))
+    assert value("region/2", counts, "exclude") == pytest.approx(100 * IN_RIGHT)
+    assert value("Var", counts, "exclude") == 0
+    # A data set whose only scored class is road has a score.
+    single = replace(of_road, unscored=("car", "person", "void"))
+    assert value("mIoU", single, "exclude") == pytest.approx(100 * 6 / 9)
+    end = ": a mean over classes is undefined"
+    for each, where in ((of_road, "the test split"), (counts, "region 1")):
+        settings = (each.by_region(), CLASSES, each.scored, "test")
+        assert scores.absent_notes(*settings, "exclude")[-1] == (
+            f"labels of a single class in {where}{end}"
+        )
+        assert not any(note.endswith(end) for note in scores.absent_notes(*settings, "released"))

@@ -47,10 +47,11 @@ def test_overlay_by_hand() -> None:
 def test_pictures_are_drawn(tmp_path: Path) -> None:
     path, label = tmp_path / "a.png", np.zeros((30, 40), np.uint8)
     label[5:15, 5:15] = 1
-    draw_region_heat(RegionHeat("x", label.astype(np.int64), (0.5, math.nan)), path)
-    image = cv2.imread(str(path))
-    assert image is not None
-    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
+    for ious in ((math.nan, math.nan), (0.5, math.nan)):
+        draw_region_heat(RegionHeat("x", label.astype(np.int64), ious), path)
+        image = cv2.imread(str(path))
+        assert image is not None
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
     rgb = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
     example = PanelExample("00001D", rgb, rgb[..., 0], label, label)
     for count in (1, 3):
