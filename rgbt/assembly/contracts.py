@@ -257,6 +257,8 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
 
     In training too, as its output may have another form there; its statistics do not change.
     """
+    from rgbt.models.external.network import author_line  # most networks are of this package
+
     model = session.model
     before = {name: value.clone() for name, value in model.named_buffers()}
     for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
@@ -270,9 +272,9 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
             raise
         except Exception as error:
             size = " x ".join(map(str, image_hw))
+            said = f"{type(error).__name__}: {one_line(error)}{author_line(error)}"
             raise InputError(
-                f"model: the network cannot predict {count} images of {size} pixels "
-                f"({type(error).__name__}: {one_line(error)})."
+                f"model: the network cannot predict {count} images of {size} pixels ({said})."
             ) from error
     for name, value in model.named_buffers():
         value.copy_(before[name])

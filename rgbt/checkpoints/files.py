@@ -25,6 +25,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
+from rgbt.files.plain_files import disguise
 
 COMMENT = b"rgbt sha256 %s"
 
@@ -160,7 +161,7 @@ def read_torch_file(path: Path, *, mapped: bool = False) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip and mapped)
     except Exception as error:  # torch raises anything on damaged bytes
         reason = re.split(ADVICE_AFTER, re.sub(ADVICE_BEFORE, "", str(error)))[0]
-        said = one_line(reason) or type(error).__name__
+        said = disguise(path) or one_line(reason) or type(error).__name__
         raise InputError(
             f"{path} cannot be read as weights ({said}); give a file of a saved state_dict()."
         ) from error
@@ -185,6 +186,9 @@ def _check_zip(path: Path) -> None:
     """Raise ValueError for an archive whose content is not what was written."""
     with zipfile.ZipFile(path) as archive:
         entries, comment = archive.infolist(), archive.comment
+        if not any(entry.filename.endswith("data.pkl") for entry in entries):
+            held = ", ".join(entry.filename for entry in entries[:3])
+            raise ValueError(f"it is a zip archive of {held}; unpack it")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("it is compressed; save it again with torch.save")
         if comment.startswith(COMMENT % b""):
@@ -212,7 +216,8 @@ def _read_safetensors(path: Path) -> Contents:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path} cannot be read as weights ({one_line(error)}).") from error
+        said = disguise(path) or one_line(error)
+        raise InputError(f"{path} cannot be read as weights ({said}).") from error
     start = f"{NOTE}."
     note = {k.removeprefix(start): v for k, v in metadata.items() if k.startswith(start)}
     return Contents(path, _without_prefixes(tensors), ours=bool(note), note=note)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 import rgbt
 from rgbt.checks import InputError, one_line
-from rgbt.files.plain_files import parse_json, read_bytes
+from rgbt.files.plain_files import disguise, parse_json, read_bytes
 from rgbt.requirements import Outputs, Record, record_of
 from rgbt.types import Output, View
 
@@ -139,6 +139,8 @@ class ExportedNetwork(nn.Module):
         """The network of a file; InputError as of the class, or if there is none."""
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
+        if said := disguise(path):
+            raise InputError(f"exported={path}: {said}.")
         return cls(read_bytes(path), path)
 
     @property
