@@ -17,7 +17,8 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -173,13 +174,21 @@ def save(path: Path, value: Any) -> None:
     Raises:
         OSError: the file cannot be written; an older file of this name is kept.
     """
-    with replacing(path) as file:
+    with replacing(path, lambda: _bytes_of(value)) as file:
         torch.save(value, file)
         size = file.tell() - 2  # torch ends the archive with the length of no comment
         file.flush()
         comment = COMMENT % _digest(Path(file.name), size)
         file.seek(size)
         file.write(struct.pack("<H", len(comment)) + comment)
+
+
+def _bytes_of(value: Any) -> int:
+    """Size of what torch.save writes, without the memory for it."""
+    sizes: list[int] = []
+    write = lambda part: sizes.append(memoryview(part).nbytes)  # noqa: E731
+    torch.save(value, cast(Any, SimpleNamespace(write=write, flush=lambda: None)))
+    return sum(sizes)
 
 
 def _check_zip(path: Path) -> None:
