@@ -78,6 +78,9 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         if isinstance(error, OSError):
             file = str(error.filename or "a file")
             return say(f"{_with_setting(file)}: {error.strerror or error}.", 2)
+        if type(error).__name__ == "OutOfMemoryError":  # of torch, which --help does not import
+            advice = "Use smaller images or batches, or trainer.accelerator=cpu"
+            return say(f"{str(error).partition('. ')[0]}. {advice}.", 2)
         raise
 
 
