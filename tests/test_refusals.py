@@ -53,6 +53,10 @@ RUN = [
     ),
     *(("masker.patch_size=48", "masker.patch_size"), ("masker=none scheme=crm", "hides_cells")),
     ("data.batch_size=9", "data.batch_size is 9"),
+    (
+        "+experiment=rgb_teacher_semseg masker=square data.batch_size=1",
+        "data.batch_size=1: SemsegPSPNet normalises one value",
+    ),
     *(
         (f"+experiment=temporal_con {words}", word)
         for words, word in (
