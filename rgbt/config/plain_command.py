@@ -80,7 +80,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             return say(f"{_with_setting(file)}: {error.strerror or error}.", 2)
         if type(error).__name__ == "OutOfMemoryError":  # of torch, which --help does not import
             advice = "Use smaller images or batches, or trainer.accelerator=cpu"
-            return say(f"{str(error).partition('. ')[0]}. {advice}.", 2)
+            return say(f"{'. '.join(str(error).split('. ')[:2])}. {advice}.", 2)
         raise
 
 

@@ -13,6 +13,7 @@ from rgbt import evaluate
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
+from rgbt.config.plain_command import exit_code
 from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
@@ -90,3 +91,9 @@ def test_settings_with_less_memory() -> None:
 def test_errors_of_memory_are_known(text: str, kind: type[Exception]) -> None:
     with pytest.raises(kind), naming_memory(torch.device("cpu"), "a step", lambda: ""):
         raise RuntimeError(text)
+
+
+def test_other_commands_end_with_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(no_memory) == 2
+    said = "rgbt: CUDA out of memory. Tried to allocate 2.00 GiB. Use smaller images or batches, or"
+    assert capsys.readouterr().err.startswith(said)
