@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
@@ -18,11 +18,8 @@ NO_MEMORY = re.compile("out of memory|_ALLOC_FAILED|can't allocate memory|not en
 
 
 @contextmanager
-def naming_memory(device: torch.device, what: str, advice: Callable[[], str]) -> Iterator[None]:
-    """Turn an error of a device without memory left into an InputError with `advice`.
-
-    `what` needs the memory: "a training step of 8 images".
-    """
+def naming_memory(device: torch.device, what: str, advice: str) -> Iterator[None]:
+    """Turn an error of a device without memory for `what`, "a step", into an InputError."""
     try:
         yield
     except RuntimeError as error:
@@ -33,7 +30,7 @@ def naming_memory(device: torch.device, what: str, advice: Callable[[], str]) ->
             peak = torch.cuda.max_memory_allocated(device) / 2**30
             free, size = (each / 2**30 for each in torch.cuda.mem_get_info(device))
             found = f" (GiB: {peak:.1f} used at most, {free:.1f} of {size:.1f} free)"
-        raise InputError(f"{device} is out of memory in {what}{found}. {advice()}") from error
+        raise InputError(f"{device} is out of memory in {what}{found}. {advice}") from error
 
 
 def training_advice(
@@ -56,10 +53,3 @@ def training_advice(
         other.append("trainer.precision=bf16-mixed")
     resumes = f"To resume it with less, set {' or '.join(same)}. " if same else ""
     return f"{resumes}A new run needs less with {' or '.join(other)}."
-
-
-def evaluation_advice(eval_batch_size: int) -> str:
-    """Settings with which an evaluation needs less."""
-    if eval_batch_size > 1:
-        return "Set data.eval_batch_size=1, with equal results."
-    return "Predict windows with prediction.window_hw=[...], or use trainer.accelerator=cpu."

@@ -208,14 +208,8 @@ def _names_by_size(session: Session, found: ToPredict) -> dict[Hw, list[str]]:
 def _image(session: Session, found: ToPredict, name: str) -> tuple[Tensor, Tensor]:
     """RGB and thermal (1, C, H, W) in [0, 1] as the network gets them: their first window."""
     batch = collate([session.transform.test(found.read(name))], "").to("cpu")
-    whole = batch.rgb.shape[-2], batch.rgb.shape[-1]
-    scale = session.prediction.scales[0]
-    scaled = _resized(
-        (batch.rgb, batch.thermal), (round(scale * whole[0]), round(scale * whole[1]))
-    )
-    height, width = _image_hw(session, whole)
-    rgb, thermal = (image[..., :height, :width] for image in scaled)
-    return rgb, thermal
+    height, width = _image_hw(session, (batch.rgb.shape[-2], batch.rgb.shape[-1]))
+    return batch.rgb[..., :height, :width], batch.thermal[..., :height, :width]
 
 
 def _resized(pair: tuple[Tensor, Tensor], hw: Hw) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import KnownScenes, LabelledDataset, Subset, background_indices, reader_of
-from rgbt.engine.memory import evaluation_advice, naming_memory
+from rgbt.engine.memory import naming_memory
 from rgbt.engine.progress import progress
 from rgbt.evaluation import prediction
 from rgbt.evaluation.prediction import Predictor, counts_of
@@ -87,7 +86,9 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     parts = []
     unmeasured: list[str] = []
     images = session.loading.eval_batch_size
-    advice = partial(evaluation_advice, images)
+    advice = "Predict windows with prediction.window_hw=[...], or use trainer.accelerator=cpu."
+    if images > 1:
+        advice = "Set data.eval_batch_size=1, with equal results."
     with naming_memory(session.device, f"an evaluation of {images} images at once", advice):
         for names, sources in prediction.parts_of_split(session.dataset, request):
             with prediction.normalised(session, predictor, request, sources) as skipped:

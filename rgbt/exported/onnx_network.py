@@ -10,7 +10,7 @@ import importlib.util
 import json
 import logging
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -129,11 +129,14 @@ class ExportedNetwork(nn.Module):
             self._graph = onnxruntime.InferenceSession(content, settings, **cpu)
             metadata = self._graph.get_modelmeta().custom_metadata_map
         self.description = made = Description.from_metadata(path, metadata)
-        kind, hw = "tensor(float)", (None, None) if made.dynamic else made.image_hw
+        kind, hw = "tensor(float)", ("open", "open") if made.dynamic else made.image_hw
         wanted = {name: (kind, (channels, *hw)) for name, channels in INPUTS.items()}
         wanted["scores"] = (kind, (len(made.classes), *hw))
         values = (*self._graph.get_inputs(), *self._graph.get_outputs())
-        found = {each.name: (each.type, _known(each.shape)[1:]) for each in values}
+        found = {}
+        for each in values:
+            sizes = ("open" if isinstance(size, str) else size for size in each.shape[1:])
+            found[each.name] = each.type, tuple(sizes)
         if found != wanted:
             raise InputError(f"{path} has the inputs and outputs {found}, but states {wanted}.")
 
@@ -176,11 +179,6 @@ class ExportedNetwork(nn.Module):
         with _explained(f"{self._path} cannot be computed"):
             (scores,) = self._graph.run(["scores"], images)
         return Output(torch.from_numpy(scores).to(rgb.device), {})
-
-
-def _known(shape: Sequence[int | str]) -> tuple[int | None, ...]:
-    """The sizes of a shape, None for one that is open and has a name."""
-    return tuple(None if isinstance(size, str) else size for size in shape)
 
 
 def require_packages() -> None:

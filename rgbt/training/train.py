@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -203,7 +202,7 @@ class Training:
         session, (height, width) = self.setup.session, self.setup.sizes["trained"]
         size, precision = session.loading.batch_size, session.trainer.precision
         network, crop_hw = record_of(session.model), record_of(session.transform).crop_hw
-        advice = partial(training_advice, session.trainer, size, network, crop_hw)
+        advice = training_advice(session.trainer, size, network, crop_hw)
         what = f"a training step of {size} images of {height}x{width} in {precision}"
         return naming_memory(session.device, what, advice)
 

@@ -89,7 +89,7 @@ def test_settings_with_less_memory() -> None:
     ],
 )
 def test_errors_of_memory_are_known(text: str, kind: type[Exception]) -> None:
-    with pytest.raises(kind), naming_memory(torch.device("cpu"), "a step", lambda: ""):
+    with pytest.raises(kind), naming_memory(torch.device("cpu"), "a step", ""):
         raise RuntimeError(text)
 
 
