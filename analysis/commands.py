@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.options import Help
 from rgbt.cores import usable_cores
-from rgbt.files.atomic import write_atomic
+from rgbt.files.atomic import check_writable, write_atomic
 from rgbt.metrics.metric import MAX_REGIONS, Absent
 from rgbt.tables import ABSENT, TextTable, csv_text, number
 from rgbt.terminal import path_lines, print_rich
@@ -72,13 +71,8 @@ class DrawOptions:
 
 def check_out(out: Path | None) -> None:
     """Refuse a folder that cannot be written (InputError), before any work."""
-    if out is None:
-        return
-    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
-    if not there.is_dir():
-        raise InputError(f"out={out}: {there} is a file; choose a folder.")
-    if not os.access(there, os.W_OK):
-        raise InputError(f"out={out}: {there} is not writable; choose another folder.")
+    if out is not None:
+        check_writable(f"out={out}", out)
 
 
 def dataset_of(overrides: Sequence[str]) -> LabelledDataset:

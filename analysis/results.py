@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from analysis.archive import archived, counts_of, unpack
 from rgbt.checks import InputError, nearest, one_line, split_list
@@ -127,7 +129,11 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     """
     root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
     folders = [each.path for each in runs_in(root)] if root.is_dir() else []
-    for path in (*filter(is_finished, folders), *archived(Path(archive))):
+    paths = [*filter(is_finished, folders), *archived(Path(archive))]
+    what, console = f"reading runs of {root} and {archive}", Console(stderr=True)
+    is_hidden = not console.is_terminal
+    # It takes a minute to unpack an archive of some hundred runs.
+    for path in track(paths, what, console=console, transient=True, disable=is_hidden):
         try:
             run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read
@@ -336,6 +342,7 @@ def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult
         raise InputError(f"{path} has {', '.join(f.name for f in files)}; name one of these.")
     groups = {run.tags.get(GROUP, "") for run in finished} - {""}
     known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
+    known = known if finished else f"; neither {runs_dir} nor {archive} has a finished run"
     if not files:
         raise InputError(
             f"'{word}' is not a run (folder, config key or MLflow run id in {runs_dir}), nor counts"

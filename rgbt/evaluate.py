@@ -73,6 +73,7 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation import request as requests
     from rgbt.evaluation import segmentation
+    from rgbt.evaluation.prediction import check_request
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
     from rgbt.terminal import print_rich, rich_table
@@ -95,6 +96,7 @@ def main(options: Options, overrides: list[str]) -> int:
         options.batch_norm, options.batch_norm_splits
     )
     opened = network.open()
+    check_request(opened, replace(request, batch_norm=batch_norm))
     announce_network(opened)
     views = record_of(opened.model).views if options.modality == ALL else (request.view,)
     by_view = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
@@ -23,8 +23,11 @@ class Options(NetworkOptions):
     modality: Modality = "default"
     head: Head = "as trained"
     image_hw: Annotated[
-        tuple[Pixels, Pixels] | None,
-        Help("height and width of the images of the graph; default: those after the transform"),
+        tuple[Pixels, Pixels] | Literal["dynamic"] | None,
+        Help(
+            "height and width of the images of the graph; default: those of most images after the "
+            "transform; dynamic: open, where the network computes the same at any size"
+        ),
     ] = None
     split: Split = "test"
     images: Annotated[int, Interval(ge=1, le=100_000), Help("images that are compared")] = 20
@@ -40,7 +43,8 @@ def main(options: Options, overrides: list[str]) -> int:
 
     Overrides such as dataset=mfnet dataset.root=/data/MFNet prediction.scales=[1.0]
     """
-    from rgbt.evaluation.export import ExportRequest, check_out, export
+    from rgbt.evaluation.export import ExportRequest, check_out, export, other_sizes
+    from rgbt.evaluation.prediction import check_request
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.terminal import path_lines, print_rich
     from rgbt.training.report import announce_network
@@ -50,6 +54,7 @@ def main(options: Options, overrides: list[str]) -> int:
     check_out(options.out)
     named = EvaluationRequest.from_options(options.split, options.modality, options.head)
     session = NetworkRequest(options, overrides).open()
+    check_request(session, named)
     announce_network(session)
     request = ExportRequest(
         out=options.out,
@@ -60,12 +65,22 @@ def main(options: Options, overrides: list[str]) -> int:
         num_images=options.images,
         tolerance=options.tolerance,
     )
-    made, compared = export(session, request)
-    height, width = made.image_hw
+    made, compared, sizes = export(session, request)
+    height, width = ("height", "width") if made.dynamic else made.image_hw
+    total, fitting = sum(sizes.values()), sizes.get(made.image_hw, 0)
+    fits = f"{fitting} of {total} images of {options.split} are {'x'.join(map(str, made.image_hw))}"
+    others = [f"{h}x{w}" for h, w in sizes if (h, w) != made.image_hw]
+    refused = "" if made.dynamic or not others else ", which the file does not take"
+    number, how = compared.num_images, "" if fitting else ", resized"
+    if made.dynamic:
+        added = other_sizes(made.image_hw)
+        number -= len(added)
+        how = f", one also as {', '.join(f'{h}x{w}' for h, w in added)}"
     lines = [
         ("inputs", f"rgb (batch, 3, {height}, {width}), thermal (batch, 1, {height}, {width})"),
         ("scores", f"(batch, {len(made.classes)}, {height}, {width}) from {made.view}"),
-        ("compared", f"{compared.num_images} images of {options.split}"),
+        ("sizes", f"{fits}{', others ' * bool(others)}{' '.join(others[:3])}{refused}"),
+        ("compared", f"{number} images of {options.split}{how}"),
         ("difference", f"{compared.difference:.3g}, largest score {compared.largest:.3g}"),
         ("same class", f"{compared.equal:.4%} of the pixels"),
         ("file", str(options.out.resolve())),

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from annotated_types import Interval
+
 from rgbt.checks import InputError, check_choice
 from rgbt.config.common_options import CorruptionName, Head, Modality, NetworkOptions, Severity
 from rgbt.config.options import Help
@@ -47,6 +49,7 @@ class Options(NetworkOptions):
     ] = False
     threshold: Annotated[
         float,
+        Interval(ge=0, le=1),
         Help("smallest confidence, 0 to 1, at which a pixel gets a label; 0: every pixel gets one"),
     ] = 0.0
 
@@ -58,6 +61,7 @@ def main(options: Options, overrides: list[str]) -> int:
     corruption.block=16 corruption.seed=1
     """
     from rgbt.evaluation import images
+    from rgbt.evaluation.prediction import Predictor
     from rgbt.evaluation.request import (
         EvaluationRequest,
         NetworkRequest,
@@ -78,14 +82,18 @@ def main(options: Options, overrides: list[str]) -> int:
     network = NetworkRequest(options, overrides)
     corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
     opened = network.open(label_map)
-    announce_network(opened)
+    Predictor(opened, opened.model, request)  # refuses a view or a head that there is not
     if not is_labelling:
         chosen = images.chosen_images(opened, options.input, options.rgb, options.thermal)
+        chosen.check_out(out)
+        announce_network(opened)
         if corruption is not None:
             chosen = corruption.images(chosen, opened, options.input)
         print(images.write_images(opened, chosen, request, out, label_map))
         return 0
     check_choice("input", options.input, opened.dataset.splits)
+    images.check_empty(out)
+    announce_network(opened)
     teacher = opened.evaluations.parent.name if options.run else opened.label
     labels = images.write_pseudo_labels(
         opened, teacher, request, out, threshold=options.threshold, label_map=label_map

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.config.command import command
+from rgbt.files.atomic import check_writable
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -37,6 +38,8 @@ def main(config: DictConfig, overrides: list[str]) -> int:
         if group is None or group.rank == 0:
             show(run, tags)
         return 0
+    folder = run.folder.parent
+    check_writable(f"runs_dir={folder}", folder)
     from rgbt.training.pipeline import start
 
     # torch is imported from here on, after --help and after finished runs

@@ -37,6 +37,11 @@ RUN = [
     *(("optimizer.lr=fast", "'optimizer.lr'"), ("trainer.clip_norm=nan", "'trainer.clip_norm'")),
     *(("seed=[0,1]", "'seed'"), ("seeds=3", "'seeds'"), ("learning", "'learning'")),
     ("--experiment=grbm", "'--experiment=grbm' is not an option"),
+    ("runs_dir=/proc/no", "runs_dir=/proc/no: cannot write in /proc (No such file"),
+    *(("model.width", "'model.width': expected KEY=VALUE"), ("=3", "'=3': expected KEY=VALUE")),
+    ("model.width=[1", "'model.width=[1': no viable alternative"),
+    ("-m hydra.sweeper.study=nan seed=0,1", "'hydra.sweeper.study': expected a finite value"),
+    ("transform.crop_hw=[48,inf]", "'transform.crop_hw[1]': expected a finite value, got inf"),
     ("hydra.searchpath=[/no/where]", "the folder /no/where does not exist"),
     ("trainer.accelerator=gpu", "'trainer.accelerator': write cuda"),
     ("dataset.root=???", "docs/how-to/prepare-data-sets.md"),
@@ -48,6 +53,10 @@ RUN = [
     ),
     *(("masker.patch_size=48", "masker.patch_size"), ("masker=none scheme=crm", "hides_cells")),
     ("data.batch_size=9", "data.batch_size is 9"),
+    (
+        "+experiment=rgb_teacher_semseg masker=square data.batch_size=1",
+        "data.batch_size=1: SemsegPSPNet normalises one value",
+    ),
     *(
         (f"+experiment=temporal_con {words}", word)
         for words, word in (
@@ -81,9 +90,10 @@ def test_run_wrong_setting_is_one_sentence(
     left_out = {*given, *(["masker.patch_size"] if unmasked else [])}
     small = [each for each in SMALL if each.partition("=")[0] not in left_out]
     place = (f"runs_dir={tmp_path}", "tracking=none", *short(1))
-    code, _, err = call(main, *usual, *place, *small, *words)
+    code, printed, err = call(main, *usual, *place, *small, *words)
     assert code == 2, err
     assert_one_sentence(err, word)
+    assert (printed, len(err.splitlines())) == ("", 1), "nothing is printed before"
     assert not list(tmp_path.iterdir())
 
 
@@ -165,6 +175,7 @@ RUN_REFUSALS = {
             *(("modality=infrared", "modality"), ("split=tset", "'tset'")),
             *(("checkpoint=first", "'checkpoint'"), ("model.num_queries=3", "'model.num_queries'")),
             *(("data.batch_siz=1", "'data.batch_size'"), ("head=source", "head=source")),
+            ("batch_norm=adabn batch_norm_splits=tset", "'tset'"),
             ("data.eval_batch_size=[1", "data.eval_batch_size"),
             *(("severity=1", "severity"), ("corruption=noise", "severity")),
         ],
@@ -172,7 +183,7 @@ RUN_REFUSALS = {
     predict.entry: (
         CRM,
         [
-            *(("", "input="), ("rgb=a.png thermal=b.png", "a.png is missing")),
+            *(("", "input="), ("rgb=a.png thermal=b.png", "rgb=a.png: there is no such")),
             ("rgb=a.png thermal=b.png input=val", "input="),
             *(("input=vall", "'val'"), ("input=val dataset.rot=x", "'dataset.root'")),
             ("input=val threshold=0.5", "threshold=0.5 requires pseudo_labels=true"),
@@ -216,12 +227,15 @@ def test_request_that_does_not_fit_is_one_sentence(
     words: tuple[str, ...],
     text: str,
     word: str,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     folder = trained(*words)
+    capfd.readouterr()
     before = sorted(path.name for path in folder.rglob("*"))
     out = [f"out={tmp_path / 'out'}"] if entry is predict.entry else []
-    code, _, err = call(entry, f"run={folder}", *out, *text.split())
+    code, printed, err = call(entry, f"run={folder}", *out, *text.split())
     assert code == 2, err
     assert_one_sentence(err, word)
+    assert (printed, len(err.splitlines())) == ("", 1), "nothing is printed before"
     assert sorted(path.name for path in folder.rglob("*")) == before
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]

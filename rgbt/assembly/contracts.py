@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.checks import InputError, check_members, described, one_line
 from rgbt.config.stored_config import EXTERNAL
@@ -227,6 +228,8 @@ def check_parts(
     tested = transform.test(shown)
     if session.spec.model.target == EXTERNAL:
         _probe_external(session, example_hw, tested.thermal.shape)
+    elif session.loading.batch_size == session.trainer.batch_norm_parts:
+        _probe_single(session, example_hw)
     crop_hw = (not is_own(masker) and records["transform"].crop_hw) or example_hw
     if records["masker"].hides_cells:
         check_masker(masker, crop_hw, torch_generator(seed, "probe"))
@@ -250,11 +253,35 @@ def first_readable(session: Session, names: tuple[str, ...]) -> Sample:
     return session.dataset.read(names[0])
 
 
+def _probe_single(session: Session, train_hw: tuple[int, int]) -> None:
+    """Refuse batches of one image where a batch normalisation gets one pixel: without variance."""
+    model, was_training = session.model, session.model.training
+    if not any(isinstance(module, _BatchNorm) for module in model.modules()):
+        return
+    before = {name: value.clone() for name, value in model.named_buffers()}
+    images = [torch.zeros(1, each, *train_hw, device=session.device) for each in (3, 1)]
+    try:
+        with torch.no_grad(), session.autocast():
+            model.train()(*images, generator=torch_generator(session.drawn.order, "probe"))
+    except ValueError as error:
+        if "more than 1 value per channel" not in str(error):
+            raise
+        raise InputError(
+            f"data.batch_size={session.loading.batch_size}: {name_of(model)} normalises one value "
+            "per channel of each batch, which has no variance; set a larger batch."
+        ) from error
+    for name, value in model.named_buffers():
+        value.copy_(before[name])
+    model.train(was_training)
+
+
 def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
     """Call another author's network once per size of image, so that it is refused before a run.
 
     In training too, as its output may have another form there; its statistics do not change.
     """
+    from rgbt.models.external.network import author_line  # most networks are of this package
+
     model = session.model
     before = {name: value.clone() for name, value in model.named_buffers()}
     for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
@@ -268,9 +295,9 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
             raise
         except Exception as error:
             size = " x ".join(map(str, image_hw))
+            said = f"{type(error).__name__}: {one_line(error)}{author_line(error)}"
             raise InputError(
-                f"model: the network cannot predict {count} images of {size} pixels "
-                f"({type(error).__name__}: {one_line(error)})."
+                f"model: the network cannot predict {count} images of {size} pixels ({said})."
             ) from error
     for name, value in model.named_buffers():
         value.copy_(before[name])

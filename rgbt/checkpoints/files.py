@@ -17,7 +17,8 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
+from rgbt.files.plain_files import disguise
 
 COMMENT = b"rgbt sha256 %s"
 
@@ -160,7 +162,7 @@ def read_torch_file(path: Path, *, mapped: bool = False) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=is_zip and mapped)
     except Exception as error:  # torch raises anything on damaged bytes
         reason = re.split(ADVICE_AFTER, re.sub(ADVICE_BEFORE, "", str(error)))[0]
-        said = one_line(reason) or type(error).__name__
+        said = disguise(path) or one_line(reason) or type(error).__name__
         raise InputError(
             f"{path} cannot be read as weights ({said}); give a file of a saved state_dict()."
         ) from error
@@ -172,7 +174,7 @@ def save(path: Path, value: Any) -> None:
     Raises:
         OSError: the file cannot be written; an older file of this name is kept.
     """
-    with replacing(path) as file:
+    with replacing(path, lambda: _bytes_of(value)) as file:
         torch.save(value, file)
         size = file.tell() - 2  # torch ends the archive with the length of no comment
         file.flush()
@@ -181,10 +183,21 @@ def save(path: Path, value: Any) -> None:
         file.write(struct.pack("<H", len(comment)) + comment)
 
 
+def _bytes_of(value: Any) -> int:
+    """Size of what torch.save writes, without the memory for it."""
+    sizes: list[int] = []
+    write = lambda part: sizes.append(memoryview(part).nbytes)  # noqa: E731
+    torch.save(value, cast(Any, SimpleNamespace(write=write, flush=lambda: None)))
+    return sum(sizes)
+
+
 def _check_zip(path: Path) -> None:
     """Raise ValueError for an archive whose content is not what was written."""
     with zipfile.ZipFile(path) as archive:
         entries, comment = archive.infolist(), archive.comment
+        if not any(entry.filename.endswith("data.pkl") for entry in entries):
+            held = ", ".join(entry.filename for entry in entries[:3])
+            raise ValueError(f"it is a zip archive of {held}; unpack it")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("it is compressed; save it again with torch.save")
         if comment.startswith(COMMENT % b""):
@@ -212,7 +225,8 @@ def _read_safetensors(path: Path) -> Contents:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path} cannot be read as weights ({one_line(error)}).") from error
+        said = disguise(path) or one_line(error)
+        raise InputError(f"{path} cannot be read as weights ({said}).") from error
     start = f"{NOTE}."
     note = {k.removeprefix(start): v for k, v in metadata.items() if k.startswith(start)}
     return Contents(path, _without_prefixes(tensors), ours=bool(note), note=note)

@@ -14,7 +14,7 @@ from typing import Any
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -121,6 +121,8 @@ def check_words(words: Sequence[str]) -> None:
     options = {each for action in get_args_parser()._actions for each in action.option_strings}
     for word in words:
         key, _, value = word.partition("=")
+        if word.startswith("="):  # Hydra raises an error of Python
+            raise InputError(f"'{word}': expected KEY=VALUE.")
         if word.startswith("-") and key not in options:
             raise InputError(f"'{word}' is not an option; write settings as KEY=VALUE.")
         for folder in split_list(value, "folders") if key == SEARCH_PATH else ():
@@ -132,6 +134,9 @@ def check_words(words: Sequence[str]) -> None:
 def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     """The message for overrides that Hydra or OmegaConf refused."""
     text = " ".join(str(error.__cause__ or error).split())
+    if isinstance(error, OverrideParseException):
+        reason = text.partition(" See https://")[0] if "=" in error.override else ""
+        return f"'{error.override}': {reason or 'expected KEY=VALUE'}."
     if isinstance(error, MissingConfigException):
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
         if not error.options:

@@ -11,10 +11,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
-from rgbt.config.options import help_text, parse, readable_paths
+from rgbt.config.options import help_text, parse, readable_paths, with_home
+from rgbt.files.atomic import check_writable
 from rgbt.runtime.signals import Stopped, answered, ending_command
 
 T = TypeVar("T")
@@ -74,8 +76,22 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
         if isinstance(error, OSError):
-            return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
+            file = str(error.filename or "a file")
+            return say(f"{_with_setting(file)}: {error.strerror or error}.", 2)
+        if type(error).__name__ == "OutOfMemoryError":  # of torch, which --help does not import
+            advice = "Use smaller images or batches, or trainer.accelerator=cpu"
+            return say(f"{'. '.join(str(error).split('. ')[:2])}. {advice}.", 2)
         raise
+
+
+def _with_setting(file: str) -> str:
+    """A path after the word of the command line that names it, or a folder above it."""
+    found, path = "", Path(file).absolute()
+    for word in sys.argv[1:]:
+        value = word.partition("=")[2]
+        named = value and path.is_relative_to(Path(with_home(value)).absolute())
+        found = word if named and len(word) > len(found) else found
+    return found if found.endswith(f"={file}") else f"{found}: {file}".removeprefix(": ")
 
 
 def say(sentence: str, code: int) -> int:
@@ -128,6 +144,9 @@ class PlainCommand(Generic[T]):
         if self.first and words and "=" not in words[0] and not words[0].startswith("-"):
             words = [f"{self.first}={words[0]}", *words[1:]]
         options, overrides = parse(self.options, words, self.heeds)
+        out = vars(options).get("out")
+        if isinstance(out, Path):  # before the work whose result it is for
+            check_writable(f"out={out}", out.parent if out.suffix else out)
         return self.main(options, readable_paths(overrides))
 
 

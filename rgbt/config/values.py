@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +33,18 @@ def check_value(path: str, value: Any, annotation: Any) -> Any:
     except pydantic.ValidationError as error:
         raise refusal(path, error) from None
     except ValueError:
-        raise InputError(f"'{path}': expected a finite value, got {repr(value)[:80]}.") from None
+        key, found = next(_not_finite(path, value), (path, value))
+        raise InputError(f"'{key}': expected a finite value, got {repr(found)[:80]}.") from None
+
+
+def _not_finite(path: str, value: Any) -> Iterator[tuple[str, float]]:
+    """Dotted key and value of every NaN and infinity in plain YAML."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    for key, inner in value.items() if isinstance(value, dict) else ():
+        yield from _not_finite(f"{path}.{key}".lstrip("."), inner)
+    for index, inner in enumerate(value) if isinstance(value, list | tuple) else ():
+        yield from _not_finite(f"{path}[{index}]", inner)
 
 
 @cache

@@ -82,8 +82,8 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
         return of_files(dataset, folder, folder)
     if not folder.is_dir():
         raise InputError(
-            f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name}; "
-            f"splits: {nearest(text, dataset.splits)}."
+            f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name} "
+            f"({nearest(text, dataset.splits)})."
         )
     pairs: dict[str, Frame] = {}
     for layout in (*images.layouts, *PLAIN):
@@ -116,6 +116,9 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
 def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
     """One pair, named after its RGB file; the same file twice is a packed one."""
     images = images_of(dataset)
+    for name, path in {"rgb": rgb, "thermal": thermal}.items():
+        if not path.is_file():
+            raise InputError(f"{name}={path}: there is no such file.")
     return ToPredict(
         (rgb.stem,),
         lambda name: images.read(name, rgb, thermal),

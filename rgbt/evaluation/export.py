@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +16,8 @@ from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import collate
-from rgbt.data.new_images import of_split
+from rgbt.data.new_images import ToPredict, of_split
+from rgbt.engine.progress import progress
 from rgbt.evaluation.prediction import heads_of, view_of
 from rgbt.exported.onnx_network import (
     Description,
@@ -44,7 +46,7 @@ class ExportRequest:
     out: Path  # new file
     view: View | None  # input images; None: those that the network is designed for
     head: TestedHead | None  # None: as the configuration of the run says
-    image_hw: Hw | None  # None: the size of the images after the transform
+    image_hw: Hw | Literal["dynamic"] | None  # None: the size of most images after the transform
     split: str  # whose images are compared
     num_images: int  # how many of them, the first ones
     tolerance: float  # see `Comparison.check`
@@ -70,18 +72,32 @@ class Comparison:
             )
 
 
-def export(session: Session, request: ExportRequest) -> tuple[Description, Comparison]:
+def export(
+    session: Session, request: ExportRequest
+) -> tuple[Description, Comparison, dict[Hw, int]]:
     """Write the exported network of `session` in float32, unless it gives other scores on the CPU.
 
-    Raises InputError for an existing file, a network with a head per image, and a graph that cannot
-    be made or that differs from the network.
+    It is compared on images of its size, resized ones where there is none; a dynamic one on images
+    of every size, and on one of them resized to `other_sizes`.
+
+    Returns:
+        what was written, the comparison, and the number of images of the split by their size.
+
+    Raises:
+        InputError: an existing file, a network with a head per image, or a graph that cannot be
+            made or that differs from the network.
     """
     check_out(request.out)
     view = view_of(session, request.view)
-    head = only_head(session, view, request.head, session.dataset.names(request.split))
-    images = list(_images(session, request))
+    found = of_split(session.dataset, request.split)
+    head = only_head(session, view, request.head, found.names)
+    by_size = _names_by_size(session, found)
+    if not by_size:
+        raise InputError(f"split '{request.split}' of {session.dataset.name} has no image.")
+    is_dynamic = request.image_hw == "dynamic"
+    most = max(by_size, key=lambda hw: len(by_size[hw]))
+    image_hw = request.image_hw if isinstance(request.image_hw, tuple) else most
     graph = ScoresOfImages(session.model.cpu().float().eval(), view=view, head=head)
-    image_hw = (images[0][0].shape[-2], images[0][0].shape[-1])
     description = Description(
         network=type(session.model).__name__,
         run=session.evaluations.parent.name if session.step else session.label,
@@ -93,16 +109,33 @@ def export(session: Session, request: ExportRequest) -> tuple[Description, Compa
         head=head,
         outputs=record_of(session.model).outputs,
         image_hw=image_hw,
+        dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.
         settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
     )
     content = onnx_bytes(graph, description)
     network = ExportedNetwork(content, request.out)
-    compared = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
-    compared.check(request.tolerance)
+    readable = [name for names in by_size.values() for name in names]
+    names = by_size.get(image_hw, readable)
+    if is_dynamic:  # one of each size, then others
+        names = [*dict.fromkeys([*(of_one[0] for of_one in by_size.values()), *readable])]
+    images = [_image(session, found, name) for name in names[: request.num_images]]
+    if is_dynamic:
+        images += [_resized(images[0], hw) for hw in other_sizes(image_hw)]
+    else:
+        images = [_resized(pair, image_hw) for pair in images]
+    try:
+        comparison = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
+        comparison.check(request.tolerance)
+    except InputError as error:
+        if not is_dynamic:
+            raise
+        raise InputError(
+            f"image_hw=dynamic: {description.network} cannot leave its size open: {error}"
+        ) from error
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(request.out, content)
-    return description, compared
+    return description, comparison, {hw: len(of_one) for hw, of_one in by_size.items()}
 
 
 def check_out(out: Path) -> None:
@@ -119,11 +152,15 @@ def compare(
 ) -> Comparison:
     """The network in PyTorch and the exported graph on the same images, at least one.
 
-    The first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal (1, 1, H, W).
+    Of each size the first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal
+    (1, 1, H, W).
     """
     difference = largest = 0.0
     same = total = 0
-    groups = [images[:1], *(images[at : at + 2] for at in range(1, len(images), 2))]
+    groups = []
+    for hw in dict.fromkeys(rgb.shape for rgb, _ in images):
+        alike = [pair for pair in images if pair[0].shape == hw]
+        groups += [alike[:1], *(alike[at : at + 2] for at in range(1, len(alike), 2))]
     with torch.inference_mode():
         for group in groups:
             rgb, thermal = (torch.cat(parts) for parts in zip(*group, strict=True))
@@ -149,19 +186,38 @@ def only_head(
     return heads.pop() if heads else None
 
 
-def _images(session: Session, request: ExportRequest) -> Iterator[tuple[Tensor, Tensor]]:
-    """Images (1, C, H, W) in [0, 1] as the network gets them, all of one size."""
-    found = of_split(session.dataset, request.split)
-    wanted = request.image_hw
-    if not found.names:
-        raise InputError(f"split '{request.split}' of {session.dataset.name} has no image.")
-    for name in found.names[: request.num_images]:
-        batch = collate([session.transform.test(found.read(name))], "").to("cpu")
-        wanted = wanted or _image_hw(session, (batch.rgb.shape[-2], batch.rgb.shape[-1]))
-        rgb, thermal = batch.rgb, batch.thermal
-        if rgb.shape[-2:] != wanted:
-            rgb, thermal = (F.interpolate(i, size=wanted, mode="bilinear") for i in (rgb, thermal))
-        yield rgb, thermal
+def other_sizes(image_hw: Hw) -> tuple[Hw, ...]:
+    """Sizes for the comparison of a dynamic graph: lower, narrower and larger, with odd sides."""
+    height, width = image_hw
+    lower, narrower = height * 3 // 4 | 1, width * 2 // 3 | 1
+    return (lower, width), (height, narrower), (height * 5 // 4 | 1, width * 5 // 4 | 1)
+
+
+def _names_by_size(session: Session, found: ToPredict) -> dict[Hw, list[str]]:
+    """Names of all images of a split by their size in one forward pass."""
+    by_size: dict[Hw, list[str]] = {}
+    with progress() as display:
+        task = display.add_task("sizes", total=len(found.names), note="images")
+        for sample in found.samples(session.loading.on_error):
+            shown = session.transform.test(sample).thermal.shape
+            by_size.setdefault(_image_hw(session, (shown[0], shown[1])), []).append(sample.name)
+            display.advance(task)
+    return by_size
+
+
+def _image(session: Session, found: ToPredict, name: str) -> tuple[Tensor, Tensor]:
+    """RGB and thermal (1, C, H, W) in [0, 1] as the network gets them: their first window."""
+    batch = collate([session.transform.test(found.read(name))], "").to("cpu")
+    height, width = _image_hw(session, (batch.rgb.shape[-2], batch.rgb.shape[-1]))
+    return batch.rgb[..., :height, :width], batch.thermal[..., :height, :width]
+
+
+def _resized(pair: tuple[Tensor, Tensor], hw: Hw) -> tuple[Tensor, Tensor]:
+    """Both images at another size, bilinear."""
+    if pair[0].shape[-2:] == hw:
+        return pair
+    rgb, thermal = (F.interpolate(image, size=hw, mode="bilinear") for image in pair)
+    return rgb, thermal
 
 
 def _image_hw(session: Session, whole: Hw) -> Hw:

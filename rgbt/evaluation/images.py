@@ -103,6 +103,12 @@ def label_map_of(name: str) -> LabelMap | None:
         return cast(LabelMap, build(compose([f"+label_map={name}"]).label_map))
 
 
+def check_empty(out: Path) -> None:
+    """Refuse a folder of pseudo-labels that holds files (InputError)."""
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"out={out}: the folder is not empty.")
+
+
 def write_pseudo_labels(
     session: Session,
     teacher: str,
@@ -142,8 +148,7 @@ def write_pseudo_labels(
         "split": request.split,
         "classes": list(session.dataset.classes),
     }
-    if out.is_dir() and any(out.iterdir()):
-        raise InputError(f"out={out}: the folder is not empty.")
+    check_empty(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
         made = Path(temporary) / out.name

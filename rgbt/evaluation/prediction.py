@@ -84,6 +84,12 @@ class Predictor:
         return self._session, self.view, self._heads(batch.name), self._settings
 
 
+def check_request(session: Session, request: EvaluationRequest) -> None:
+    """Refuse a view, head or split that there is not, before anything is printed (InputError)."""
+    Predictor(session, session.model, request)
+    parts_of_split(session.dataset, request)
+
+
 def _hw(images: Tensor) -> tuple[int, int]:
     return images.shape[-2], images.shape[-1]
 
@@ -100,8 +106,13 @@ def view_of(session: Session, view: View | None = None) -> View:
 def heads_of(
     session: Session, view: View, head: TestedHead | None = None
 ) -> Callable[[tuple[str, ...]], tuple[str | None, ...]]:
-    """Names of images -> the head that predicts each; None: the network's only one."""
+    """Names of images -> the head that predicts each; None: the network's only one.
+
+    InputError: `head` selects one of two, and the network has one.
+    """
     requested = session.domains.tested_head if head is None else head
+    if head not in (None, "own"):
+        session.domains.head_of(view, None, head)  # there are two
 
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
         dark = None

@@ -19,6 +19,7 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import KnownScenes, LabelledDataset, Subset, background_indices, reader_of
+from rgbt.engine.memory import naming_memory
 from rgbt.engine.progress import progress
 from rgbt.evaluation import prediction
 from rgbt.evaluation.prediction import Predictor, counts_of
@@ -84,10 +85,15 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     counters = _detail_counters(session, request)
     parts = []
     unmeasured: list[str] = []
-    for names, sources in prediction.parts_of_split(session.dataset, request):
-        with prediction.normalised(session, predictor, request, sources) as skipped:
-            unmeasured += skipped
-            parts.append(_count(session, predictor, request, names, counters))
+    images = session.loading.eval_batch_size
+    advice = "Predict windows with prediction.window_hw=[...], or use trainer.accelerator=cpu."
+    if images > 1:
+        advice = "Set data.eval_batch_size=1, with equal results."
+    with naming_memory(session.device, f"an evaluation of {images} images at once", advice):
+        for names, sources in prediction.parts_of_split(session.dataset, request):
+            with prediction.normalised(session, predictor, request, sources) as skipped:
+                unmeasured += skipped
+                parts.append(_count(session, predictor, request, names, counters))
     every = joined(
         [each for part in parts for each in collected(part)], session.dataset.names(split)
     )

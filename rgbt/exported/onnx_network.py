@@ -1,4 +1,4 @@
-"""A network as one ONNX graph with fixed image size: traced, written, and computed by onnxruntime.
+"""A network as one ONNX graph: traced, written, and computed by onnxruntime.
 
 An ONNX file is data: a graph of named operators with their constants, and no code. A graph whose
 constants are in other files is refused.
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 import rgbt
 from rgbt.checks import InputError, one_line
-from rgbt.files.plain_files import parse_json, read_bytes
+from rgbt.files.plain_files import disguise, parse_json, read_bytes
 from rgbt.requirements import Outputs, Record, record_of
 from rgbt.types import Output, View
 
@@ -52,6 +52,8 @@ class Description:
         view: input images that the graph uses; the other image is an input too and is ignored.
         head: of a network with one head per domain; None: it has one for all images.
         outputs: whether the scores are of classes, or sums over masks of queries.
+        image_hw: size of its images, or of most where it is `dynamic`.
+        dynamic: whether it takes images of any size.
         settings: configuration of the run, without tracking: how images are read and predicted.
     """
 
@@ -66,6 +68,7 @@ class Description:
     head: str | None = None
     outputs: Outputs
     image_hw: tuple[int, int]
+    dynamic: bool = False
     settings: dict[str, Any]
     rgb: str = "float32, (batch, 3, height, width), R, G, B in [0, 1]"
     thermal: str = "float32, (batch, 1, height, width), grey level in [0, 1]"
@@ -126,11 +129,14 @@ class ExportedNetwork(nn.Module):
             self._graph = onnxruntime.InferenceSession(content, settings, **cpu)
             metadata = self._graph.get_modelmeta().custom_metadata_map
         self.description = made = Description.from_metadata(path, metadata)
-        kind, hw = "tensor(float)", made.image_hw
+        kind, hw = "tensor(float)", ("open", "open") if made.dynamic else made.image_hw
         wanted = {name: (kind, (channels, *hw)) for name, channels in INPUTS.items()}
         wanted["scores"] = (kind, (len(made.classes), *hw))
         values = (*self._graph.get_inputs(), *self._graph.get_outputs())
-        found = {each.name: (each.type, tuple(each.shape)[1:]) for each in values}
+        found = {}
+        for each in values:
+            sizes = ("open" if isinstance(size, str) else size for size in each.shape[1:])
+            found[each.name] = each.type, tuple(sizes)
         if found != wanted:
             raise InputError(f"{path} has the inputs and outputs {found}, but states {wanted}.")
 
@@ -139,6 +145,8 @@ class ExportedNetwork(nn.Module):
         """The network of a file; InputError as of the class, or if there is none."""
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
+        if said := disguise(path):
+            raise InputError(f"exported={path}: {said}.")
         return cls(read_bytes(path), path)
 
     @property
@@ -160,11 +168,15 @@ class ExportedNetwork(nn.Module):
             raise InputError(f"modality: {self._path} predicts from {made.view} alone.")
         if head not in (None, made.head):
             raise InputError(f"head={head}: {self._path} has the head '{made.head}'.")
+        found = rgb.shape[-2], rgb.shape[-1]
+        if not made.dynamic and found != made.image_hw:
+            (height, width), wanted = found, "x".join(map(str, made.image_hw))
+            raise InputError(
+                f"{self._path} takes images of {wanted}, got {height}x{width}; export the network "
+                f"with image_hw=dynamic or image_hw={height},{width}."
+            )
         images = {"rgb": rgb.float().cpu().numpy(), "thermal": thermal.float().cpu().numpy()}
-        advice = (
-            f"Its images have the size {made.image_hw}; export it with image_hw=... for others."
-        )
-        with _explained(f"{self._path} cannot be computed", advice):
+        with _explained(f"{self._path} cannot be computed"):
             (scores,) = self._graph.run(["scores"], images)
         return Output(torch.from_numpy(scores).to(rgb.device), {})
 
@@ -178,7 +190,10 @@ def require_packages() -> None:
 
 
 def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
-    """The content of an ONNX file; the size of the batch stays open.
+    """The content of an ONNX file; the size of the batch stays open, of a dynamic one all sizes.
+
+    Whether the graph is right at other sizes than that of `made` has to be compared: what a network
+    makes of its size in Python is as for that one.
 
     Raises:
         InputError: the network depends on values of the images or of the batch in Python, or has
@@ -186,15 +201,25 @@ def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
     """
     # Two images: PyTorch would take a batch of one for a constant.
     images = tuple(torch.full((2, channels, *made.image_hw), 0.5) for channels in INPUTS.values())
-    batch = torch.export.Dim("batch", min=1)
+    batch, side = torch.export.Dim("batch", min=1), torch.export.Dim.DYNAMIC
+    sizes = {0: batch, 2: side, 3: side} if made.dynamic else {0: batch}
     advice = "Its forward must not depend on values in Python; use x.shape[0] instead of len(x)."
     with torch.no_grad():
         # What networks keep per image size is made before: in the trace it would have no values.
         graph.eval()(*images)
+        if made.dynamic:
+            advice = "Omit image_hw=dynamic: this network cannot leave its size open."
         with _explained(f"{made.network} cannot be exported", advice):
-            dynamic = ({0: batch}, {0: batch})
+            # Sizes that a network compares, such as those of two padded maps, need no proof.
+            program = torch.export.export(
+                graph,
+                images,
+                dynamic_shapes=(sizes, sizes),
+                strict=False,
+                prefer_deferred_runtime_asserts_over_guards=made.dynamic,
+            )
             written = torch.onnx.export(
-                torch.export.export(graph, images, dynamic_shapes=dynamic, strict=False),
+                program,
                 (),
                 dynamo=True,
                 opset_version=OPSET,

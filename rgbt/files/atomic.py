@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
+import shutil
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+from rgbt.checks import InputError
 
 # Seconds between two attempts to take a lock.
 POLL_S = 0.1
@@ -18,34 +23,79 @@ POLL_S = 0.1
 # age in seconds above which such a file is abandoned.
 LEFT_BEHIND, STALE_S = re.compile(r"\..+\.partial|\..+\.(\d+)"), 3600.0
 
+# No space left, none within the quota, or above the largest size of a file that is allowed.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 # Descriptors of locks of this process; loader workers forked from it must not keep them.
 _held: set[int] = set()
 
 
+def check_writable(setting: str, folder: Path) -> None:
+    """Refuse a folder in which nothing can be written or made, before any work; it stays as it is.
+
+    `setting` is the word that named it, such as "runs_dir=/data", with which the InputError begins.
+    """
+    places = (folder.absolute(), *folder.absolute().parents)
+    there = next(each for each in places if os.path.exists(each))  # noqa: PTH110 - raises nothing
+    try:
+        # Permissions do not tell: of a file system that is read-only or full, or of /proc.
+        with tempfile.TemporaryDirectory(prefix=".", dir=there):
+            pass
+    except OSError as error:
+        said = f"{setting}: cannot write in {there} ({error.strerror})"
+        raise InputError(f"{said}; choose another folder.") from error
+
+
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file; a reader, or a machine that crashes, sees the old or the new content."""
-    with replacing(path) as file:
+    with replacing(path, lambda: len(content)) as file:
         file.write(content)
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which replaces `path` when the block ends without an exception."""
+def replacing(path: Path, size: Callable[[], int] | None = None) -> Iterator[BinaryIO]:
+    """A file to write, which replaces `path` when the block ends without an exception.
+
+    OSError as of `naming_full_disk`; then `path` is as it was.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.unlink(missing_ok=True)  # never write through a link of this name
-    try:
-        with temporary.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with naming_full_disk(path, size):
+        temporary.unlink(missing_ok=True)  # never write through a link of this name
+        try:
+            with temporary.open("xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+@contextmanager
+def naming_full_disk(path: Path, size: Callable[[], int] | None = None) -> Iterator[None]:
+    """Let an error of a full disk name the file that is written, and the bytes needed and free.
+
+    Writers of archives raise errors of their own instead, with that of the disk as their context.
+    `size`: computes the bytes that the file needs.
+    """
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and getattr(cause, "errno", None) not in FULL:
+            cause = cause.__cause__ or cause.__context__
+        if not isinstance(cause, OSError):
+            raise
+        needed = f"{size() / 1e6:.2f} MB are needed, " if size else ""
+        free = shutil.disk_usage(path.parent).free / 1e6
+        room = f"{needed}{free:.2f} MB are free"
+        said = f"{cause.strerror} ({room}); free some and rerun the command"
+        raise OSError(cause.errno, said, str(path)) from error
 
 
 def remove_left_behind(folder: Path, writer: int | None) -> None:

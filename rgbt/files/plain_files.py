@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import zlib
 from collections.abc import Mapping
 from functools import cache
@@ -15,6 +16,17 @@ from rgbt.files.atomic import write_atomic
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
+
+
+# Beginnings of files that are no weights or arrays, and what to do.
+DISGUISES = {
+    "<!doctype html": "a web page; download the file itself",
+    "<html": "a web page; download the file itself",
+    "<?xml": "a message of a server in XML; download the file itself",
+    "{": "a text in JSON; download the file itself",
+    "version https://git-lfs": "a pointer of Git LFS; get the file with git lfs pull",
+    "\x1f\ufffd": "packed with gzip; unpack it",
+}
 
 
 def check_links(folder: Path) -> None:
@@ -44,6 +56,21 @@ def read_bytes(path: Path) -> bytes:
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is not a regular file.")
     return path.read_bytes()
+
+
+def disguise(path: Path) -> str:
+    """What a file is that its reader refused: "it is a web page"; "" for an unknown one.
+
+    Servers and git put such files in the place of weights and arrays.
+    """
+    start = path.open("rb").read(512) if path.is_file() else b"\0"
+    text = re.sub(rb"\s+", b" ", start).strip().decode("ascii", errors="replace").lower()
+    for beginning, what in DISGUISES.items():
+        if text.startswith(beginning):
+            return f"it is {what}"
+    if text.isprintable() and "\ufffd" not in text:
+        return f"it is a text that begins with '{text[:40]}'" if text else "it is empty"
+    return ""
 
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:

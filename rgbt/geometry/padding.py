@@ -18,6 +18,6 @@ def padded_hw(image_hw: tuple[int, int], multiple: int = STRIDE) -> tuple[int, i
 def pad_to(tensor: Tensor, hw: tuple[int, int], value: float = 0.0) -> Tensor:
     """`tensor` (..., H, W) padded with `value` at the bottom and right to `hw`."""
     height, width = tensor.shape[-2:]
-    if (height, width) == hw:
+    if isinstance(height, int) and (height, width) == hw:  # not of a graph for any size
         return tensor
     return F.pad(tensor, (0, hw[1] - width, 0, hw[0] - height), value=value)

@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
+from rgbt.files.atomic import check_writable, replacing
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.masker import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
@@ -69,6 +70,7 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
     path = Path(config.out or "")
     if path.suffix != ".png":
         raise InputError(f"out must be a PNG file, such as out=masks.png, got {config.out}.")
+    check_writable(f"out={path}", path.parent)
     masker: AnyMasker = build(config.masker)
     dataset, transform = build(config.dataset), build(config.transform)
     examples = [
@@ -77,7 +79,8 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
     ]
     check_masker(masker, examples[0].rgb.shape[:2], torch_generator(config.seed, "probe"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    draw(masker, examples, config.seed, config.name).savefig(path, dpi=120)
+    with replacing(path) as file:
+        draw(masker, examples, config.seed, config.name).savefig(file, dpi=120, format="png")
     print(path)
     return 0
 

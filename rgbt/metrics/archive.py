@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
+from rgbt.files.plain_files import disguise
 
 FORMAT, DIGEST = "format", "digest"  # members of every file
 T = TypeVar("T")
@@ -47,7 +48,8 @@ class Archive:
                 raise ValueError(f"expected the mark '{self.mark}', got '{one_line(mark)}'")
             return build(arrays)
         except Exception as error:  # zipfile and NumPy raise anything on damaged bytes
-            reason = f"is not a readable file of {self.what} ({one_line(error)})"
+            said = disguise(path) or one_line(error)
+            reason = f"is not a readable file of {self.what} ({said})"
             raise InputError(f"'{path}' {reason}; {self.advice}.") from error
 
 

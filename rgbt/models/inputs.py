@@ -137,7 +137,8 @@ class Network(nn.Module):
 def padded(image: Tensor, multiple: int) -> Tensor:
     """(N, C, H, W) padded with 0 at the bottom and right to sides that `multiple` divides."""
     below, right = (-side % multiple for side in image.shape[2:])
-    return F.pad(image, (0, right, 0, below)) if below or right else image
+    is_padded = isinstance(below, int) and not (below or right)  # not in a graph for any size
+    return image if is_padded else F.pad(image, (0, right, 0, below))
 
 
 def luma_of(rgb: Tensor) -> Tensor:

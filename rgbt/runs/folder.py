@@ -20,7 +20,14 @@ from typing import Any, Literal, cast
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
+from rgbt.files.atomic import (
+    holder_of,
+    holding,
+    is_held,
+    naming_full_disk,
+    remove_left_behind,
+    write_atomic,
+)
 from rgbt.files.plain_files import check_links, parse_json, read_json, write_json
 from rgbt.tables import ResultTables
 from rgbt.terminal import info, warn
@@ -210,7 +217,8 @@ class RunFolder:
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
         """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
         plain = {name: float(value) for name, value in values.items()}
-        with (self.path / "metrics.jsonl").open("a") as file:
+        path = self.path / "metrics.jsonl"
+        with naming_full_disk(path), path.open("a") as file:
             file.write(MetricLine(step, kind, round(time.time(), 3), plain).text())
 
     def lines(self) -> list[MetricLine]:

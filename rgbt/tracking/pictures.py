@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from rgbt.files.atomic import replacing
 from rgbt.types import IGNORE
 
 if TYPE_CHECKING:
@@ -122,7 +123,8 @@ def draw_columns(
     figure.legend(
         handles=patches, loc="outside lower center", ncols=min(len(patches), 9), fontsize=8
     )
-    figure.savefig(path)
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
 
 
 def _broken(name: str, letters: int) -> str:
@@ -196,7 +198,8 @@ def draw_region_heat(heat: RegionHeat, path: Path) -> None:
             box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
             axis.text(place[1], place[0], text, ha="center", va="center", fontsize=size, bbox=box)
     figure.colorbar(shown, ax=axis, label="mIoU of the region, percent", shrink=0.85)
-    figure.savefig(path)
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
 
 
 def _figure(width_inches: float, height_inches: float) -> Figure:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from rgbt.assembly.training_setup import TrainingSetup, set_up_training, validat
 from rgbt.checks import InputError
 from rgbt.data.domains import TestedHead
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
+from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
@@ -34,6 +35,7 @@ from rgbt.evaluation.segmentation import (
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.processes import agreed, alone
+from rgbt.requirements import record_of
 from rgbt.runs.folder import (
     MarkerForm,
     MetricLine,
@@ -160,7 +162,8 @@ class Training:
             self._resume(trainer, state)
             accumulate = session.trainer.accumulate
             steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
-            trainer.fit(self._batches(steps, state), state)
+            with self._naming_memory():
+                trainer.fit(self._batches(steps, state), state)
             agreed(None)  # process 0 has written the best checkpoint
             checkpoints = Checkpoints(self.folder.path)
             restore_weights(session.model, checkpoints.load_best(state), checkpoints.best)
@@ -193,6 +196,15 @@ class Training:
             raise
         with deferred():  # a signal must not leave a finished run as running in the store
             self.tracking.finish("FINISHED")
+
+    def _naming_memory(self) -> AbstractContextManager[None]:
+        """Name the settings of this run with which a step needs less memory."""
+        session, (height, width) = self.setup.session, self.setup.sizes["trained"]
+        size, precision = session.loading.batch_size, session.trainer.precision
+        network, crop_hw = record_of(session.model), record_of(session.transform).crop_hw
+        advice = training_advice(session.trainer, size, network, crop_hw)
+        what = f"a training step of {size} images of {height}x{width} in {precision}"
+        return naming_memory(session.device, what, advice)
 
     def _claim(self, fingerprint: str) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""

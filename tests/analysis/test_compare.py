@@ -203,7 +203,7 @@ def test_triples_of_methods_differ_in_first_frame_classes() -> None:
         (["level=2"], "level must be between 0.5 and 0.999, got 2"),
         (["blocks=20"], "blocks=20: 40 images make 2 blocks"),
         (["condition=noise", "frames=next"], "is of single frames; omit frames="),
-        (["out={}/crm.npz"], "is a file; choose a folder"),
+        (["out={}/crm.npz"], "(Not a directory); choose another folder"),
         (["b={}/crm.npz"], "a and b both contain"),
         (["frames=aligned"], "crm.npz is by ring2, not frames=aligned"),
         (["b=aaa0", "frames=next"], "frames=next is not counted in {}/runs/aaa0, which has none"),

@@ -225,7 +225,10 @@ def test_seeds_of_one_method_have_distinct_labels(call: Call, tmp_path: Path) ->
     ("arguments", "word"),
     [
         (("predictions=a",), "no data set is named; set dataset=mfnet"),
-        (("predictions=a", "dataset=mfnet", "out=/dev/null/x"), "is a file; choose a folder"),
+        (
+            ("predictions=a", "dataset=mfnet", "out=/dev/null/x"),
+            "(Not a directory); choose another folder",
+        ),
         ((), "expected either predictions=folder or counts=run"),
         (("predictions=a", "counts=b"), "expected either predictions=folder or counts=run"),
         (("split=val",), "lacks 2 of the 2 images"),

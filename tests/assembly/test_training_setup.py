@@ -56,6 +56,16 @@ def composed(words: Callable[..., list[str]]) -> Composed:
     return make
 
 
+def test_probe_of_a_batch_of_one_leaves_no_trace(composed: Composed) -> None:
+    model = set_up_training(composed("start_deeplabv2")).session.model
+    norms = [each for each in model.modules() if isinstance(each, torch.nn.BatchNorm2d)]
+    assert norms
+    for norm in norms:
+        assert norm.training
+        assert norm.num_batches_tracked == 0
+        assert not norm.running_mean.any()
+
+
 def test_class_weights_are_those_of_the_training_split(composed: Composed) -> None:
     """Of the loss, and of a loss inside another one; numbers do not read a label."""
     spec = composed("start_deeplabv2", "loss.class_weights=inverse")

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import onnx
 import pytest
@@ -16,9 +17,11 @@ import torch
 from torch import Tensor
 
 from rgbt import evaluate, export, predict
+from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import available, compose
-from rgbt.evaluation.export import Comparison, compare, only_head
+from rgbt.evaluation import export as exporting
+from rgbt.evaluation.export import Comparison, compare, only_head, other_sizes
 from rgbt.exported.onnx_network import (
     Description,
     ExportedNetwork,
@@ -29,7 +32,8 @@ from rgbt.exported.onnx_network import (
 from rgbt.metrics.counts import Counts
 from rgbt.requirements import record_of
 from rgbt.types import Output
-from tests.commands import Call, Trained, assert_one_sentence, code_of, short
+from tests.commands import SPLITS, Call, Trained, assert_one_sentence, code_of, short
+from tests.conftest import write_data
 
 PREDICT, EXPORT = predict.entry, export.entry
 ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
@@ -142,7 +146,7 @@ def test_what_a_prediction_refuses(
     (tmp_path / "cut.onnx").write_bytes(exported.read_bytes()[:4000])
     (tmp_path / "text.onnx").write_bytes(b"not a graph")
     for file, word, said in (
-        (exported, "transform.test_short_edge=24", "cannot be computed"),
+        (exported, "transform.test_short_edge=24", "takes images of 48x64, got 24x32; export"),
         (exported, "run=any", "exported"),
         (exported, "modality=rgb", "modality: 'rgb' is not a valid choice"),
         (tmp_path / "cut.onnx", "", "cut.onnx"),
@@ -232,6 +236,78 @@ def test_a_comparison_counts_the_largest_difference_and_equal_classes() -> None:
     for difference, equal in ((0.0041, 1.0), (0.0, 0.9985), (float("nan"), 1.0)):
         with pytest.raises(ValueError, match="no file was written"):
             Comparison(1, difference, 4.0, equal).check(1e-3)
+
+
+def test_size_is_that_of_most_images(
+    trained: Trained, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first of three test images is wider than others; the network stands for its graph."""
+    names = SPLITS["test"]
+    root = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    for kind in ("images", "labels"):
+        path = root / kind / f"{names[0]}.png"
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
+    seen: list[tuple[int, ...]] = []
+
+    def computed(graph: ScoresOfImages, _: Path) -> Callable[..., Output]:
+        def compute(rgb: Tensor, thermal: Tensor) -> Output:
+            seen.extend([(rgb.shape[2], rgb.shape[3])] * len(rgb))
+            return Output(graph(rgb, thermal), {})
+
+        return compute
+
+    monkeypatch.setattr(exporting, "onnx_bytes", lambda graph, _: graph)
+    monkeypatch.setattr(exporting, "ExportedNetwork", computed)
+    monkeypatch.setattr(exporting, "write_atomic", lambda *_: None)
+    others = [(37, 64), (48, 43), (61, 81)]  # 3/4, 2/3 and 5/4 of the sides, made odd
+    fits = "2 of 3 images of test are 48x64, others 48x77"
+    for words, sizes, said in (
+        ((), [(48, 64)] * 2, (f"{fits}, which the file does not take\n", "2 images of test\n")),
+        (("image_hw=48,77",), [(48, 77)], ("1 of 3 images", "compared    1 images of test\n")),
+        (("image_hw=32,32",), [(32, 32)] * 3, ("0 of 3 images", "3 images of test, resized\n")),
+        (
+            ("image_hw=dynamic",),
+            [(48, 77), (48, 64), (48, 64), *others],
+            (f"{fits}\n", "3 images of test, one also as 37x64, 48x43, 61x81\n"),
+        ),
+    ):
+        seen.clear()
+        out = tmp_path / "new.onnx"
+        place = (f"run={trained(*ONE)}", f"dataset.root={root}", f"out={out}")
+        code, printed, err = call(EXPORT, *place, *words)
+        assert code == 0, err
+        assert sorted(seen) == sorted(sizes)
+        for each in said:
+            assert each in printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "is_right"), [("deeplabv2_tiny", True), ("semseg_tiny", False)])
+def test_dynamic_graph_is_compared_at_other_sizes(name: str, is_right: bool) -> None:
+    """One network has the same scores at any size; in the other, pools have the traced size."""
+    torch.manual_seed(0)
+    network = build(compose([f"model={name}", "model.num_classes=9"]).model).eval()
+    graph = ScoresOfImages(network, view=record_of(network).views[0], head=None)
+    made = Description(
+        network=name,
+        classes=tuple("abcdefghi"),
+        view=record_of(network).views[0],
+        outputs="scores",
+        image_hw=(48, 64),
+        dynamic=True,
+        settings={},
+    )
+    exported = ExportedNetwork(onnx_bytes(graph, made), Path(name))
+    images = [
+        (torch.rand(1, 3, *hw), torch.rand(1, 1, *hw)) for hw in ((48, 64), *other_sizes((48, 64)))
+    ]
+    try:
+        found = compare(graph, lambda *pair: exported(*pair).logits, images)
+        found.check(1e-5)
+    except InputError:
+        assert not is_right
+    else:
+        assert is_right
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from the weights that its configuration names.
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import module_from_spec
 from pathlib import Path
@@ -28,10 +29,16 @@ def skip_init(*names: str) -> None:
 
 
 def stand_in(name: str, **attributes: Any) -> None:
-    """Let a package be imported that is not installed: a mock, but for `attributes`."""
-    parts = name.split(".")
+    """Let a package be imported that may be missing: itself, or else a mock with `attributes`."""
+    try:
+        import_module(name)
+        return
+    except ImportError:  # also where it does not fit what is installed
+        parts = name.split(".")
     for length in range(1, len(parts) + 1):
-        sys.modules.setdefault(".".join(parts[:length]), MagicMock(__path__=[]))
+        part = ".".join(parts[:length])
+        spec = ModuleSpec(part, None, is_package=True)
+        sys.modules.setdefault(part, MagicMock(__path__=[], __spec__=spec))
     for key, value in attributes.items():
         setattr(sys.modules[name], key, value)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -218,7 +219,8 @@ def build(folder: Path, constructor: str, arguments: Mapping[str, Any]) -> nn.Mo
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        raise InputError(f"{setting}: {type(error).__name__}: {one_line(error)}.") from error
+        said = f"{type(error).__name__}: {one_line(error)}{author_line(error)}"
+        raise InputError(f"{setting}: {said}.") from error
     finally:
         # Networks may import when they are called, but nothing of ours finds modules there first.
         sys.path.remove(str(folder))
@@ -226,6 +228,14 @@ def build(folder: Path, constructor: str, arguments: Mapping[str, Any]) -> nn.Mo
     if not isinstance(network, nn.Module):
         raise InputError(f"{setting} returned {described(network)}; expected a torch.nn.Module.")
     return network
+
+
+def author_line(error: BaseException) -> str:
+    """Where code of the checkout raised an error, ", /code/net.py line 3"; "": elsewhere."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if any(Path(frame.filename).is_relative_to(folder) for folder in _held):
+            return f", {frame.filename} line {frame.lineno}"
+    return ""
 
 
 def _function(folder: Path, constructor: str) -> Callable[..., Any]:

@@ -25,6 +25,7 @@ from tests.models.external.standins import (
     PAIR,
     STACKED,
     external,
+    forget,
     images,
     own_process,  # noqa: F401 - used by every test
     write_checkout,
@@ -117,6 +118,28 @@ def test_adapter_builds_an_odd_network(tmp_path: Path, monkeypatch: pytest.Monke
     torch.testing.assert_close(net(rgb, thermal).logits, expected)
     assert net.network.two == 2
     assert torch.load is load
+
+
+def test_stand_in_is_for_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installed package is itself; what no stand-in has is named with the line of its import."""
+    monkeypatch.setenv("RGBT_CONF", f"{tmp_path / 'none'},{tmp_path / 'conf'}")
+    write_checkout(tmp_path / "conf/model/external", {"odd.py": ADAPTER.replace("allow_cpu()", "")})
+    code = ODD.replace(".cuda()", "") + "\nimport absent.models\n"
+    folder = write_checkout(tmp_path / "code", {"toolbox/net.py": code})
+    line = 1 + code.splitlines().index("import absent.models")
+    with pytest.raises(InputError, match=rf"'absent\.models'.*code/toolbox/net\.py line {line}\."):
+        external(folder, constructor="odd.py:network")
+    registry = """
+from unittest.mock import MagicMock
+ARCH = MagicMock()
+def twice(value):
+    return 2 * value + 1
+"""
+    empty = dict.fromkeys(("absent/__init__.py", "absent/tools.py", "absent/models.py"), "")
+    installed = write_checkout(tmp_path / "site", {**empty, "absent/registry.py": registry})
+    monkeypatch.syspath_prepend(installed)
+    forget()
+    assert external(folder, constructor="odd.py:network").network.two == 3
 
 
 def test_untrained_functions_ignore_pretrained() -> None:
