@@ -194,6 +194,7 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     ):
         each.save(folder / f"evaluations/{name}.npz")
     replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
+    replace(some(100), split="val").save(folder / "evaluations/synth_val_thermal_ring2.npz")
     write_run(runs, "fff0", "robust", 0, SCORES)
     frame = results(runs, archive)
     at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
