@@ -199,11 +199,11 @@ class Training:
 
     def _naming_memory(self) -> AbstractContextManager[None]:
         """Name the settings of this run with which a step needs less memory."""
-        session, (height, width) = self.setup.session, self.setup.sizes["trained"]
+        session, sizes = self.setup.session, self.setup.sizes["trained"]
         size, precision = session.loading.batch_size, session.trainer.precision
         network, crop_hw = record_of(session.model), record_of(session.transform).crop_hw
         advice = training_advice(session.trainer, size, network, crop_hw)
-        what = f"a training step of {size} images of {height}x{width} in {precision}"
+        what = f"a training step of {size} images of {sizes} in {precision}"
         return naming_memory(session.device, what, advice)
 
     def _claim(self, fingerprint: str) -> None:
