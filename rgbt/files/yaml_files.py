@@ -14,7 +14,7 @@ import yaml
 from omegaconf._utils import get_yaml_loader  # private: its rules for numbers are those of Hydra
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.plain_files import read_bytes
+from rgbt.files.plain_files import check_seal, read_bytes
 
 # Tags whose values are plain; every other one is refused.
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
@@ -62,10 +62,14 @@ def _refused(reason: str, node: yaml.Node) -> yaml.MarkedYAMLError:
 def read_yaml(path: Path) -> Any:
     """The content of a file; InputError as of `parse_yaml`, or if it is no readable file."""
     try:
-        return parse_yaml(read_bytes(path).decode(), str(path))
+        content = read_bytes(path)
+        check_seal(content)
+        return parse_yaml(content.decode(), str(path))
     except FileNotFoundError:
         raise InputError(f"the file {path} does not exist.") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as YAML: {error}.") from error
 
 

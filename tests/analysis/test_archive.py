@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
@@ -183,7 +184,7 @@ def test_check_reports_changed_keys(
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
     some(0, run="0123456789ab").save(folder / "counts_test.npz")
-    (folder / "result.json").write_text('{"dataset": "abc"}')
+    write_json(folder / "result.json", {"dataset": "abc"})
     add(RunResult(folder), archive)
     code, out, _ = call(entry, "check", f"archive={archive}")
     assert code == 1
