@@ -156,3 +156,17 @@ def test_a_stored_configuration_names_no_folder_to_write_into(
     typed = load_spec(settings, [f"dataset.cache_dir={tmp_path / 'typed'}", "data.cache=auto"])
     assert typed.dataset.plain["cache_dir"] == str(tmp_path / "typed")
     assert (typed.data.cache, spec.data.cache) == ("auto", None)
+
+
+def test_images_are_written_inside_the_folder_that_is_named(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    """A line of a list may begin with "../", as long as the image is in the data set."""
+    stranger = Path(shutil.copytree(data, tmp_path / "in" / "stranger"))
+    name = (stranger / "test.txt").read_text().split()[0]
+    (stranger / "test.txt").write_text(f"../../stranger/images/{name}\n")
+    run, out = trained(*ONE), tmp_path / "x" / "out"
+    words = (f"run={run}", f"dataset.root={stranger}", "input=test", f"out={out}")
+    code, _, err = call(predict.entry, *words)
+    assert (code, "leads out of" in err) == (2, True), err
+    assert not (tmp_path / "stranger").exists()

@@ -35,11 +35,11 @@ def check_links(folder: Path) -> None:
 
 
 def inside(path: Path, folder: Path) -> Path:
-    """`path`, if it is in `folder` after all links are resolved; InputError if not."""
+    """`path`, if it is in `folder` after all links and ".." are resolved; InputError if not."""
     # `os.path`: `Path.resolve` raises for a circle of links.
     found, root = os.path.realpath(path), os.path.realpath(folder)
     if not Path(found).is_relative_to(root):
-        raise InputError(f"{path} is a link that leads out of {folder}; remove it.")
+        raise InputError(f"{path} is a link that leads out of {folder}, or has a name that does.")
     return path
 
 

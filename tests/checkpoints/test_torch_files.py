@@ -174,6 +174,7 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     config.write_text(stored.replace("seed: 1\n", "seed: 3\n", 1))
     code, _, err = call(evaluate.entry, *evaluated)
     assert (code, "config.yaml cannot be read" in err, "checksum" in err) == (2, True, True)
+    config.write_text(stored)
     edit_config(folder, "seed: 1\n", "seed: 3\n")
     code, _, err = call(evaluate.entry, *evaluated)
     assert (code, "config.yaml was changed after training" in err) == (2, True)
