@@ -153,29 +153,33 @@ def _create_database(database: Path, artifact_uri: str | None) -> None:
 
 
 def _take_files_along(database: Path, files: Path) -> None:
-    """Let the store in a folder that was moved or copied name the files that moved with it.
+    """Let the store of a folder that was moved or copied name the files that moved with it.
 
     MLflow notes the absolute address of the files of every run. InputError: one lies elsewhere.
     """
-    own = files / ARTIFACTS
     with closing(sqlite3.connect(database)) as connection, connection:
         for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
             for row, uri in connection.execute(f"SELECT rowid, {column} FROM {table}").fetchall():
-                address = urlparse(str(uri))
-                path = Path(unquote(address.path))
-                is_plain = ".." not in path.parts
-                if address.scheme == "mlflow-artifacts" and is_plain and not address.netloc:
-                    continue  # of an experiment that somebody made in the pages
-                is_plain &= address.scheme in ("", "file") and not address.netloc
-                if is_plain and path.is_relative_to(own):
-                    continue
-                _, found, rest = str(path).rpartition(f"/{ARTIFACTS}")
-                moved = Path(f"{own}{rest}")
-                is_moved = found and rest[:1] in ("", "/") and (moved.exists() or not path.exists())
-                if not (is_plain and is_moved):
-                    raise InputError(OUTSIDE.format(uri))
-                change = f"UPDATE {table} SET {column} = ? WHERE rowid = ?"
-                connection.execute(change, (moved.as_uri(), row))
+                if (address := _address_in(files / ARTIFACTS, str(uri))) != uri:
+                    change = f"UPDATE {table} SET {column} = ? WHERE rowid = ?"
+                    connection.execute(change, (address, row))
+
+
+def _address_in(own: Path, uri: str) -> str:
+    """`uri` if its files are in the folder `own`, or where they moved to in it; else InputError."""
+    address = urlparse(uri)
+    path = Path(unquote(address.path))
+    if ".." not in path.parts and not address.netloc:
+        is_local = address.scheme in ("", "file")
+        # The latter is of an experiment that somebody made in the pages.
+        if (is_local and path.is_relative_to(own)) or address.scheme == "mlflow-artifacts":
+            return uri
+        _, found, rest = str(path).rpartition(f"/{ARTIFACTS}")
+        moved = Path(f"{own}{rest}")
+        is_moved = is_local and found and rest[:1] in ("", "/")
+        if is_moved and (moved.exists() or not path.exists()):
+            return moved.as_uri()
+    raise InputError(OUTSIDE.format(uri))
 
 
 @contextmanager

@@ -80,6 +80,7 @@ def test_nothing_is_sent_to_an_address_of_a_folder(
         (run, f"{files.as_uri()}/../../mlartifacts/x"),
         (run, f"file://{address[7:]}{files}"),
         (run, f"mlflow-artifacts://{address[7:]}/1"),
+        (run, f"s3://{files}"),
     ):
         with closing(sqlite3.connect(tmp_path / "stranger" / "mlflow.db")) as database, database:
             database.execute(runs)
