@@ -159,10 +159,10 @@ def _take_files_along(database: Path, files: Path) -> None:
     """
     with closing(sqlite3.connect(database)) as connection, connection:
         for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
-            for row, uri in connection.execute(f"SELECT rowid, {column} FROM {table}").fetchall():
-                if (address := _address_in(files / ARTIFACTS, str(uri))) != uri:
-                    change = f"UPDATE {table} SET {column} = ? WHERE rowid = ?"
-                    connection.execute(change, (address, row))
+            rows = connection.execute(f"SELECT {column}, rowid FROM {table}").fetchall()
+            found = [(_address_in(files / ARTIFACTS, str(uri)), row) for uri, row in rows]
+            changed = set(found) - set(rows)
+            connection.executemany(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", changed)
 
 
 def _address_in(own: Path, uri: str) -> str:
