@@ -305,13 +305,12 @@ def add_runs(options: AddOptions, _: list[str]) -> int:
 
 
 def check(options: ArchiveOptions, _: list[str]) -> int:
-    """Compare every archived run with its counts, and its key with that of its command today."""
+    """Compose the command of every archived run again, and report whose key has changed."""
     found = list(_compared(options.archive))
-    rows = [(path.stem, state, reason) for path, state, reason, _ in found if state != "same"]
+    rows = [(each.path.stem, each.state, each.reason) for each in found if each.state != "same"]
     if rows:
         print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
-    good = len(found) - len(rows)
-    print_rich(f"{len(found)} runs, {good} have the scores of their counts and today's key.")
+    print_rich(f"{len(found)} runs, {len(found) - len(rows)} have the key of their command.")
     return int(bool(rows))
 
 
@@ -322,25 +321,34 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
     """
     from omegaconf import OmegaConf
 
-    for path, state, _, spec in list(_compared(options.archive)):
-        if state != "added" or spec is None:
-            continue
+    for each in [each for each in _compared(options.archive) if each.state == "added"]:
         with tempfile.TemporaryDirectory() as scratch:
-            folder = unpack(path, Path(scratch)).folder
-            (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(spec.plain)))
-            write_json(folder / "result.json", {**(read_result(folder) or {}), "key": spec.key})
-            for file in counts_of(folder):
-                counts = Counts.load(file)
-                replace(counts, run=spec.key if counts.run else "").save(file)
-            added = add(RunResult(folder.rename(folder.with_name(spec.key))), options.archive)
-        path.unlink()
-        print_rich(plain_text(f"{path}  ->  {added}"))
+            folder = unpack(each.path, Path(scratch)).folder
+            settings = OmegaConf.to_yaml(OmegaConf.create(dict(each.settings)))
+            (folder / "config.yaml").write_text(settings)
+            write_json(folder / "result.json", {**(read_result(folder) or {}), "key": each.key})
+            for path in counts_of(folder):
+                counts = Counts.load(path)
+                replace(counts, run=each.key if counts.run else "").save(path)
+            new = folder.rename(folder.with_name(each.key))
+            path = add(RunResult(new), options.archive)
+        each.path.unlink()
+        print_rich(plain_text(f"{each.path}  ->  {path}"))
     return 0
 
 
-# File, state, reason and what its command requests today. The state is "same" (key); "added"
-# (another key, but only for settings that were added); "changed"; or "damaged".
-Compared = tuple[Path, str, str, "RunSpec | None"]
+class Compared(NamedTuple):
+    """An archived run beside the run that its command requests today.
+
+    `state` is "same" (key); "added" (another key, but only for settings that were added);
+    "changed" (other settings); or "damaged", if the command does not compose any more, too.
+    """
+
+    path: Path
+    state: str
+    reason: str = ""
+    key: str = ""
+    settings: Mapping[str, Any] = {}
 
 
 def _compared(archive: Path) -> Iterator[Compared]:
@@ -348,30 +356,34 @@ def _compared(archive: Path) -> Iterator[Compared]:
     from omegaconf.errors import OmegaConfBaseException
 
     with tempfile.TemporaryDirectory() as scratch:
-        for path in track(archived(archive), "checking", console=Console(stderr=True)):
+        for path in archived(archive):
             try:
-                stored = unpack(path, Path(scratch))
-                stored.check()
-                yield _compare(path, stored)
+                yield _compare(path, unpack(path, Path(scratch)))
             except (InputError, HydraException, OmegaConfBaseException) as error:
-                yield path, "damaged", str(error), None
+                yield Compared(path, "damaged", str(error))
 
 
 def _compare(path: Path, stored: RunResult) -> Compared:
-    from rgbt.config.compose import flatten
-    from rgbt.runs.run_spec import is_in_key
-    from rgbt.runs.specify import request_again
+    from rgbt.config.compose import compose, flatten
+    from rgbt.runs.run_spec import NOT_IN_KEY
+    from rgbt.runs.specify import requested_run
 
-    spec = request_again(stored.settings, stored.description.overrides)
+    words, settings = stored.description.overrides, stored.settings
+    # The command of an upstream run is that of its experiment, without the seed.
+    spec = requested_run(compose(words), words).with_seed(int(settings["seed"]))
     if spec.is_run(stored):
-        return path, "same", "", spec
-    before, now, none = flatten(stored.settings), flatten(spec.plain), object()
-    keys = sorted(filter(is_in_key, before.keys() | now.keys()))
-    differing = [key for key in keys if before.get(key, none) != now.get(key, none)]
+        return Compared(path, "same")
+    before, now, none = flatten(settings), flatten(spec.plain), object()
+    differing = [
+        key
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key, none) != now.get(key, none)
+        and not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
+    ]
     # Nothing says how an upstream run differs.
     is_added = bool(differing) and all(key not in before for key in differing)
     reason = ", ".join(differing) or "a run that it depends on"
-    return path, "added" if is_added else "changed", reason, spec
+    return Compared(path, "added" if is_added else "changed", reason, spec.key, spec.plain)
 
 
 entry = CommandGroup(
