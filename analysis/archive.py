@@ -19,6 +19,7 @@ import hashlib
 import io
 import json
 import lzma
+import math
 import os
 import tempfile
 import zipfile
@@ -44,7 +45,7 @@ from rgbt.files.plain_files import sealed, write_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import details_of
 from rgbt.metrics.pairs import protocol_of
-from rgbt.runs.folder import find_run, is_finished, read_result, runs_in
+from rgbt.runs.folder import RunFolder, find_run, is_finished, read_result, runs_in
 from rgbt.runs.result import RunResult
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table, warn
@@ -62,6 +63,9 @@ PACKED_TEXTS = "texts.json.z"
 
 # LZMA without contexts (lc) and alignment (pb): bytes of equal significance follow each other.
 BYTES = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "pb": 0}]
+
+# Bytes that a member may unpack to; the largest of ours is below 1e7.
+MOST = 10**9
 
 PROVENANCE = (
     "started command git_commit git_dirty code python threads platform cpu cpu_usable gpus cuda"
@@ -151,7 +155,20 @@ def add(run: RunResult, folder: Path) -> Path:
 
 def _members(path: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(path) as archive:
+        _check_size(sum(each.file_size for each in archive.infolist()))
         return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _check_size(size: int) -> None:
+    if size > MOST:
+        raise ValueError(f"it unpacks to more than {MOST} bytes")
+
+
+def _decompressed(content: bytes) -> bytes:
+    unpacker = lzma.LZMADecompressor()
+    found = unpacker.decompress(content, MOST)
+    _check_size(len(found) + (not unpacker.eof))
+    return found
 
 
 @contextmanager
@@ -174,7 +191,7 @@ def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
         | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}
         for entry in run.provenance
     ]
-    texts["provenance.json"] = json.dumps(entries, indent=1)
+    texts["provenance.json"] = json.dumps(sealed({"processes": entries}), indent=1)
     # Its parameters, for MLflow, are the configuration again.
     texts["run.json"] = json.dumps(sealed(vars(replace(run.description, params={}))))
     members = {PACKED_TEXTS: _packed_texts(json.dumps(texts).encode(), shared)}
@@ -208,7 +225,8 @@ def _packed_texts(texts: bytes, shared: Path) -> bytes:
 def _unpack_texts(content: bytes, shared: Path) -> dict[str, bytes]:
     known = shared / f"{Path(content[:16].decode()).name}.json"
     unpacker = zlib.decompressobj(-zlib.MAX_WBITS, zdict=_checked(known.read_bytes(), known))
-    texts = unpacker.decompress(content[16:]) + unpacker.flush()
+    texts = unpacker.decompress(content[16:], MOST)
+    _check_size(len(texts) + len(unpacker.unconsumed_tail))
     return {name: text.encode() for name, text in json.loads(texts).items()}
 
 
@@ -247,10 +265,11 @@ def _by_label(counts: NDArray[Any], partition: str) -> tuple[NDArray[Any], NDArr
 
 
 def _unpack_counts(content: bytes, shared: Path) -> Counts:
-    line, _, body = lzma.decompress(content).partition(b"\n")
+    line, _, body = _decompressed(content).partition(b"\n")
     fields: dict[str, Any] = json.loads(line)
     arrays = _shared_arrays(shared, str(fields.pop("shared")))
     kind, images, *rest = fields.pop("counts")
+    _check_size(math.prod((images, *rest)) * np.dtype(kind).itemsize)
     images_last = np.zeros((*rest, images), kind)
     bits, planes = np.split(np.frombuffer(body, np.uint8), [-(-images_last.size // 8)])
     is_there = np.unpackbits(bits, count=images_last.size).astype(bool).reshape(images_last.shape)
@@ -267,7 +286,7 @@ def _unpack_counts(content: bytes, shared: Path) -> Counts:
 def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:
     """The arrays of a file that is named by the digest of its content."""
     file = shared / f"{Path(name).name}.npz.xz"
-    content = _checked(lzma.decompress(file.read_bytes()), file)
+    content = _checked(_decompressed(file.read_bytes()), file)
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return dict(arrays)
 
@@ -317,7 +336,7 @@ def add_runs(options: AddOptions, _: list[str]) -> int:
 def check(options: ArchiveOptions, _: list[str]) -> int:
     """Compare every archived run with its counts, and its key with that of its command today."""
     found = list(_compared(options.archive))
-    rows = [(path.stem, state, reason) for path, state, reason, _ in found if state != "same"]
+    rows = [(path.stem, state, why) for path, state, why, _spec in found if state != "same"]
     if rows:
         print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
     good = len(found) - len(rows)
@@ -332,12 +351,12 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
     """
     from omegaconf import OmegaConf
 
-    for path, state, _, spec in list(_compared(options.archive)):
+    for path, state, _reason, spec in list(_compared(options.archive)):
         if state != "added" or spec is None:
             continue
         with tempfile.TemporaryDirectory() as scratch:
             folder = unpack(path, Path(scratch)).folder
-            (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(spec.plain)))
+            RunFolder(folder).write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
             write_json(folder / "result.json", {**(read_result(folder) or {}), "key": spec.key})
             for file in counts_of(folder):
                 counts = Counts.load(file)

@@ -75,6 +75,16 @@ def train(call: Call, data: Path, runs: Path, *overrides: str) -> tuple[int, str
     return call(main, *words_of(data, runs, *overrides))
 
 
+def edit_config(folder: Path, old: str, new: str) -> None:
+    """Write another ``config.yaml`` with the checksum that fits it."""
+    from rgbt.runs.folder import RunFolder
+
+    lines = (folder / "config.yaml").read_text().splitlines(keepends=True)
+    text = "".join(line for line in lines if not line.startswith("#"))
+    assert old in text
+    RunFolder(folder).write_config(text.replace(old, new, 1))
+
+
 def only_run(runs: Path) -> Path:
     (result,) = runs.glob("*/result.json")
     return result.parent

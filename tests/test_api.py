@@ -21,7 +21,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.runs.run_spec import settings_digest
-from tests.commands import Call, Trained, short
+from tests.commands import Call, Trained, edit_config, short
 
 ONE = ("+experiment=crm", *short(1))
 """A run that several test files read."""
@@ -100,7 +100,7 @@ def test_own_classes_are_refused_until_their_module_is_trusted(
     shutil.copytree(run.folder, folder)
     config = folder / "config.yaml"
     loss = "rgbt.losses.set_criterion.SetCriterion"
-    config.write_text(config.read_text().replace(loss, "api_lab.MyLoss"))
+    edit_config(folder, loss, "api_lab.MyLoss")
     best = read_torch_file(folder / "best.pt")
     best[NOTE] = {"key": folder.name, "settings": settings_digest(read_settings(config))}
     save(folder / "best.pt", best)

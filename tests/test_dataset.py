@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -15,13 +14,14 @@ from rgbt.data.mfnet import CLASSES, MFNet
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabelled, Unlabelled
 from rgbt.dataset import DatasetWrapper, reader_of
 from rgbt.evaluation.request import CorruptedDataset, choose_corruption
+from rgbt.files.plain_files import write_json
 
 NAMES = ("00001D", "00002N")
 
 
 def pseudo(source: MFNet, folder: Path) -> PseudoLabelled:
     manifest = {"format": FORMAT, "classes": CLASSES, "digest": "abc"}
-    (folder / "pseudo_labels.json").write_text(json.dumps(manifest))
+    write_json(folder / "pseudo_labels.json", manifest)
     return PseudoLabelled(source, folder, with_confidence=True)
 
 

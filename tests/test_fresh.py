@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import read_provenance, runs_in
 from tests.commands import Call, Trained, only_run, short, train
@@ -25,7 +25,7 @@ def runs(trained: Trained, tmp_path: Path) -> Path:
 def pretend(folder: Path, **changes: Any) -> None:
     """The first process of the run ran other code."""
     first, *others = read_provenance(folder / "provenance.json")
-    (folder / "provenance.json").write_text(json.dumps([{**first, **changes}, *others]))
+    write_json(folder / "provenance.json", {"processes": [{**first, **changes}, *others]})
 
 
 @pytest.mark.slow

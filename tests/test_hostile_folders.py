@@ -12,11 +12,13 @@ import rgbt
 from analysis.results import finished_runs, open_counts
 from rgbt import consistency, evaluate, predict, robustness
 from rgbt.checks import InputError
+from rgbt.config.compose import compose, resolved
 from rgbt.files.atomic import holding, is_held, write_atomic
 from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.folder import RunFolder, find_run, read_result, runs_in
 from rgbt.runs.result import RunResult
+from rgbt.runs.specify import load_spec
 from tests.commands import Call, Trained, short, train
 
 ONE = ("+experiment=crm", *short(1))
@@ -129,3 +131,42 @@ def test_pipe_in_place_of_file_is_refused_at_once(hostile: Path, name: str) -> N
     assert not is_held(hostile / name)
     with pytest.raises(InputError, match="not a regular file"):
         read_yaml(hostile / name)
+
+
+def test_a_stored_configuration_names_no_folder_to_write_into(
+    tmp_path: Path,
+    victim: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "own"))
+    sizes = [f"dataset.num_{split}=1" for split in ("train", "val", "test")]
+    sizes += ["dataset.height=48", "dataset.width=64", "dataset.num_classes=9"]
+    settings = resolved(compose(["+experiment=crm", "scale=demo", "tracking=none", *sizes]))
+    settings["dataset"] |= {"cache_dir": str(victim), "name": "../../victim/x"}
+    settings["data"]["cache"] = str(victim / "decoded")
+    settings["runs_dir"] = settings["out"] = str(victim / "runs")
+    inner = {**settings["dataset"], "name": "inner"}
+    settings["transform"] = {key: inner[key] for key in inner if key != "absent"}
+    before, spec = state(victim), load_spec(settings)
+    for part in spec.build("dataset", "transform").values():
+        assert part.root.parent == tmp_path / "own" / "rgbt"
+    assert state(victim) == before
+    assert capsys.readouterr().err.count("of the stored configuration is not used") == 3
+    typed = load_spec(settings, [f"dataset.cache_dir={tmp_path / 'typed'}", "data.cache=auto"])
+    assert typed.dataset.plain["cache_dir"] == str(tmp_path / "typed")
+    assert (typed.data.cache, spec.data.cache) == ("auto", None)
+
+
+def test_images_are_written_inside_the_folder_that_is_named(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    """A line of a list may begin with "../", as long as the image is in the data set."""
+    stranger = Path(shutil.copytree(data, tmp_path / "in" / "stranger"))
+    name = (stranger / "test.txt").read_text().split()[0]
+    (stranger / "test.txt").write_text(f"../../stranger/images/{name}\n")
+    run, out = trained(*ONE), tmp_path / "x" / "out"
+    words = (f"run={run}", f"dataset.root={stranger}", "input=test", f"out={out}")
+    code, _, err = call(predict.entry, *words)
+    assert (code, "leads out of" in err) == (2, True), err
+    assert not (tmp_path / "stranger").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 
 from rgbt import consistency, evaluate, predict, robustness
 from rgbt.data.pseudo_labels import FORMAT
+from rgbt.files.plain_files import write_json
 from rgbt.run import main
 from tests.commands import (
     DAYS_AND_NIGHTS,
@@ -128,7 +128,7 @@ def test_domains_that_do_not_fit_are_one_sentence(
     folder = tmp_path / "labels"
     folder.mkdir()
     said = {"format": FORMAT, "digest": "abc", "classes": ["road", "car"]}
-    (folder / "pseudo_labels.json").write_text(json.dumps(said))
+    write_json(folder / "pseudo_labels.json", said)
     experiment, *words = text.replace("FOLDER", str(folder)).split()
     place = (f"dataset.cache_dir={drawn}", f"runs_dir={tmp_path / 'runs'}", *short(2))
     code, _, err = call(main, f"+experiment={experiment}", *DAYS_AND_NIGHTS, *place, *words)

@@ -36,7 +36,7 @@ from rgbt.evaluation.prediction import Predictor, view_of, weights_digest
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.files.atomic import write_atomic
-from rgbt.files.plain_files import write_json
+from rgbt.files.plain_files import inside, write_json
 from rgbt.tables import TextTable, percent
 from rgbt.terminal import info
 from rgbt.tracking.pictures import overlay
@@ -73,8 +73,9 @@ def write_images(
             classes = predictor.classes(batch_of(session, sample))[0].cpu().numpy()
             classes = classes if label_map is None else label_map(classes)
             painted = overlay(sample.rgb, classes, legend)
-            write_png(out / f"{sample.name}_overlay.png", painted[..., ::-1])
-            write_png(out / f"{sample.name}.png", classes)
+            # A line of a list of images may begin with "../".
+            write_png(inside(out / f"{sample.name}_overlay.png", out), painted[..., ::-1])
+            write_png(inside(out / f"{sample.name}.png", out), classes)
             written += 1
             display.advance(task)
     for first in list(images.skipped.values())[:1]:
@@ -182,8 +183,8 @@ def _predict(
                 known = known if label_map is None else label_map(known)
                 label = np.where(sure < threshold, np.uint8(IGNORE), known)
                 scaled = np.rint(FULL * sure.astype(np.float64)).clip(0, FULL).astype(np.uint16)
-                write_png(confidence_path(out, name), scaled)
-                write_png(label_path(out, name), label)
+                write_png(inside(confidence_path(out, name), out), scaled)
+                write_png(inside(label_path(out, name), out), label)
                 digest.update(f"{name} {label.shape}\n".encode())
                 digest.update(label.tobytes())
                 digest.update(scaled.astype("<u2").tobytes())

@@ -35,6 +35,7 @@ from rgbt.evaluation.images import write_png
 from rgbt.evaluation.pair_frames import Pairing, frame_pairs
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.temporal_consistency import Pairs, count_predicted, to_bytes
+from rgbt.files.plain_files import inside
 from rgbt.metrics import pair_list
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
@@ -123,8 +124,8 @@ def write_images(source: PairSource, split: str, frames: Frames, out: Path) -> P
 
 def _write(batch: Batch, names: Sequence[str], out: Path) -> None:
     for name, rgb, thermal in zip(names, batch.rgb, batch.thermal, strict=True):
-        write_png(out / "rgb" / f"{name}.png", to_bytes(rgb)[..., ::-1])
-        write_png(out / "thermal" / f"{name}.png", to_bytes(thermal)[..., 0])
+        write_png(inside(out / "rgb" / f"{name}.png", out), to_bytes(rgb)[..., ::-1])
+        write_png(inside(out / "thermal" / f"{name}.png", out), to_bytes(thermal)[..., 0])
 
 
 class FolderPredictions:

@@ -85,7 +85,7 @@ def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> 
     trained_on = (marker or {}).get("files")
     if trained_on in (None, found := dataset.fingerprint()):
         return ()
-    return (f"{dataset.name}-{found[:8]}",)
+    return (f"{dataset.name.replace('/', '_')}-{found[:8]}",)
 
 
 Statistics = Literal["recomputed", "adabn", "batch"]

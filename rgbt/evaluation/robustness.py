@@ -21,6 +21,7 @@ from rgbt.evaluation.request import (
 )
 from rgbt.evaluation.segmentation import evaluate
 from rgbt.files.atomic import write_atomic
+from rgbt.files.plain_files import sealed, write_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.scores import summary
@@ -114,16 +115,15 @@ def _counts(session: Session, condition: Condition, shared: dict[str, Any], fold
         **{key: getattr(condition, key) for key in described},
         "corruption": None if corruption is None else corruption.identity(),
     }
-    made = json.loads(json.dumps(decisive))
     with suppress(OSError, ValueError):  # missing or damaged
-        if json.loads(made_file.read_text()) == made:
+        if json.loads(made_file.read_text()) == sealed(decisive):
             return Counts.load(counts_file)
     request = EvaluationRequest(split=shared["split"], view=condition.view, corruption=corruption)
     counts = evaluate(session, session.model, request).counts
     # The description must not outlive the counts it belongs to.
     made_file.unlink(missing_ok=True)
     counts.save(counts_file)
-    write_atomic(made_file, json.dumps(made, indent=1).encode())
+    write_json(made_file, decisive)
     return counts
 
 

@@ -28,6 +28,9 @@ DISGUISES = {
     "\x1f\ufffd": "packed with gzip; unpack it",
 }
 
+# Beginning of the comment that seals a text, and the reason of a refusal.
+SEAL, UNLIKE_SEAL = b"# crc32 ", "it does not match its checksum"
+
 
 def check_links(folder: Path) -> None:
     """Refuse a folder with a link that leads out of it, or with a pipe or device as a file.
@@ -43,11 +46,11 @@ def check_links(folder: Path) -> None:
 
 
 def inside(path: Path, folder: Path) -> Path:
-    """`path`, if it is in `folder` after all links are resolved; InputError if not."""
+    """`path`, if it is in `folder` after all links and ".." are resolved; InputError if not."""
     # `os.path`: `Path.resolve` raises for a circle of links.
     found, root = os.path.realpath(path), os.path.realpath(folder)
     if not Path(found).is_relative_to(root):
-        raise InputError(f"{path} is a link that leads out of {folder}; remove it.")
+        raise InputError(f"{path} is a link that leads out of {folder}, or has a name that does.")
     return path
 
 
@@ -79,14 +82,29 @@ def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
     return {**plain, "crc32": f"{zlib.crc32(json.dumps(plain, sort_keys=True).encode()):08x}"}
 
 
-def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
-    """Write a JSON file; a mapping is `sealed`."""
-    content = sealed(value) if isinstance(value, Mapping) else value
-    write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+def sealed_text(text: bytes) -> bytes:
+    """YAML with the checksum of its bytes as a comment, which is its first and its last line.
+
+    Damage to one of the lines does not make it a text without a checksum.
+    """
+    line = SEAL + f"{zlib.crc32(text):08x}\n".encode()
+    return line + text + line
+
+
+def check_seal(content: bytes) -> None:
+    """ValueError: a `sealed_text` was changed. Texts of others have no such comment."""
+    text = content.partition(b"\n")[2].rpartition(SEAL)[0]
+    if SEAL in content and content != sealed_text(text):
+        raise ValueError(UNLIKE_SEAL)
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON file that is `sealed`."""
+    write_atomic(path, (json.dumps(sealed(value), indent=1) + "\n").encode())
 
 
 def read_json(path: Path, form: Any, advice: str) -> Any:
-    """The content of a JSON file (`parse_json`); a link out of its folder is refused.
+    """The content of a sealed JSON file (`parse_json`); a link out of its folder is refused.
 
     Args:
         path: of the file, which exists.
@@ -94,7 +112,7 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
         advice: what to do with a damaged file, at the end of the InputError.
     """
     try:
-        return parse_json(read_bytes(inside(path, path.parent)), form)
+        return parse_json(read_bytes(inside(path, path.parent)), form, is_sealed=True)
     except InputError:
         raise
     except (ValueError, OSError) as error:
@@ -102,18 +120,19 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
         raise InputError(f"{path} is damaged ({one_line(reason)}); {advice}.") from error
 
 
-def parse_json(text: bytes | str, form: Any) -> Any:
-    """The value of a JSON text as the type `form`; the seal of a mapping is compared and removed.
+def parse_json(text: bytes | str, form: Any, *, is_sealed: bool = False) -> Any:
+    """The value of a JSON text as the type `form`, of which a sealed mapping may have more keys.
 
-    ValueError: no JSON in UTF-8, another type than `form`, or another checksum.
+    ValueError: no JSON in UTF-8, another type than `form`, or a mapping with another checksum or
+    none, which is removed.
     """
     import pydantic
 
     try:
         plain = json.loads(text)
-        is_sealed = isinstance(plain, dict) and "crc32" in plain
-        if is_sealed and sealed(plain)["crc32"] != plain.pop("crc32"):
-            raise ValueError("it does not match its checksum")
+        is_mapping = is_sealed and isinstance(plain, dict)
+        if is_mapping and sealed(plain)["crc32"] != plain.pop("crc32", None):
+            raise ValueError(UNLIKE_SEAL)
         extra: Literal["allow", "forbid"] = "allow" if is_sealed else "forbid"
         return _adapter(form).validate_json(json.dumps(plain), strict=True, extra=extra)
     except RecursionError as error:

@@ -5,6 +5,8 @@ Objects and interpolations are handled in `rgbt.config.stored_config`.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,15 @@ import yaml
 from omegaconf._utils import get_yaml_loader  # private: its rules for numbers are those of Hydra
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.plain_files import read_bytes
+from rgbt.files.plain_files import check_seal, read_bytes
 
 # Tags whose values are plain; every other one is refused.
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
+
+# Characters of a number: Python raises for longer ones at many places, or takes minutes.
+NUMBER_LENGTH = 100
+# Levels of mappings and lists inside each other; readers of the values call themselves for each.
+MAX_DEPTH = 50
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -28,35 +35,63 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         if tag is None or tag.rpartition(":")[2] in PLAIN
     }
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        # A kilobyte of aliases of aliases stands for more values than a computer has memory.
+        if node in self.constructed_objects:
+            raise _refused("found an alias (*name) of this value; write the value again", node)
+        is_number = node.tag.endswith((":int", ":float"))
+        if is_number and len(node.value) > NUMBER_LENGTH:
+            raise _refused(f"found a number of {len(node.value)} characters", node)
+        return super().construct_object(node, deep)
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merge nothing: a key ``<<`` has no plain value, and is refused."""
+
     def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
         found: dict[Any, Any] = super().construct_mapping(node, deep)
         if len(found) < len(node.value):
-            keys = [str(key.value) for key, _ in node.value]
-            reason = f"duplicate key {max(keys, key=keys.count)!a}"
-            raise yaml.constructor.ConstructorError(None, None, reason, node.start_mark)
+            keys = Counter(str(key.value) for key, _ in node.value)
+            raise _refused(f"duplicate key {keys.most_common(1)[0][0]!a}", node)
         return found
+
+
+def _refused(reason: str, node: yaml.Node) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(None, None, reason, node.start_mark)
 
 
 def read_yaml(path: Path) -> Any:
     """The content of a file; InputError as of `parse_yaml`, or if it is no readable file."""
     try:
-        return parse_yaml(read_bytes(path).decode(), str(path))
+        content = read_bytes(path)
+        check_seal(content)
+        return parse_yaml(content.decode(), str(path))
     except FileNotFoundError:
         raise InputError(f"the file {path} does not exist.") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as YAML: {error}.") from error
 
 
 def parse_yaml(text: str, source: str) -> Any:
     """Plain values (dict, list, str, int, float, bool, None) of a text from `source`.
 
-    InputError: not one document, a duplicate key, or a tag of another value.
+    InputError: not one document, a duplicate key, an alias, or a tag of another value.
     """
     try:
-        return yaml.load(text, _Loader)
+        content = yaml.load(text, _Loader)
+        level, depth = [content], 0
+        while level := [value for node in level for value in _inside(node)]:
+            if (depth := depth + 1) > MAX_DEPTH:
+                raise ValueError(f"it has more than {MAX_DEPTH} levels")
+        return content
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         reason = " ".join(part for part in (error.context, error.problem) if part)
         raise InputError(f"{source}, line {mark.line + 1}: {one_line(reason)}.") from error
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: an integer of 5,000 digits
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"{source} cannot be read as YAML: {one_line(error)}.") from error
+
+
+def _inside(node: Any) -> Iterable[Any]:
+    return node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()

@@ -15,6 +15,8 @@ from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
 from rgbt.files.plain_files import disguise
 
+# Bytes that the arrays of a file hold at most: a megabyte of zeros can stand for a gigabyte.
+MAX_BYTES = 2**33
 FORMAT, DIGEST = "format", "digest"  # members of every file
 T = TypeVar("T")
 
@@ -41,6 +43,9 @@ class Archive:
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         try:
             with np.load(path, allow_pickle=False) as stored:
+                size = sum(member.file_size for member in stored.zip.infolist())
+                if size > MAX_BYTES:
+                    raise ValueError(f"it holds {size / 2**30:.0f} GiB")
                 arrays = {name: stored[name] for name in stored.files}
             if str(arrays.pop(DIGEST)) != _digest(arrays):
                 raise ValueError("its content does not match its digest")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.atomic import write_atomic
-from rgbt.files.plain_files import read_json
+from rgbt.files.plain_files import read_json, write_json
 
 PAIR_LIST = "pairs.json"
 
@@ -55,7 +53,7 @@ class PairList:
 
     def write(self, folder: Path) -> None:
         """Write ``pairs.json``."""
-        write_atomic(folder / PAIR_LIST, f"{json.dumps(asdict(self), indent=1)}\n".encode())
+        write_json(folder / PAIR_LIST, asdict(self))
 
 
 def second_name(first: str, frames: Frames, number: int) -> str:

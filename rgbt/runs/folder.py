@@ -11,6 +11,7 @@ import json
 import math
 import re
 import time
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -28,7 +29,14 @@ from rgbt.files.atomic import (
     remove_left_behind,
     write_atomic,
 )
-from rgbt.files.plain_files import check_links, parse_json, read_json, write_json
+from rgbt.files.plain_files import (
+    UNLIKE_SEAL,
+    check_links,
+    parse_json,
+    read_json,
+    sealed_text,
+    write_json,
+)
 from rgbt.tables import ResultTables
 from rgbt.terminal import info, warn
 
@@ -60,16 +68,29 @@ class MetricLine:
     @classmethod
     def read_all(cls, lines: Sequence[bytes]) -> list[MetricLine]:
         """The lines as objects; ValueError where one is damaged."""
-        text = b"[" + b",".join(lines).replace(b": null", b": NaN") + b"]"
+        if any(line != _sealed_line(line[:-SEAL_LENGTH]) for line in lines):
+            raise ValueError(UNLIKE_SEAL)
+        bodies = (line[:-SEAL_LENGTH] + b"}" for line in lines)
+        text = b"[" + b",".join(bodies).replace(b": null", b": NaN") + b"]"
         found = cast("list[MetricLine]", parse_json(text, list[cls]))  # type: ignore[valid-type]
         if len(found) != len(lines):
             raise ValueError("expected one object in each line")
         return found
 
-    def text(self) -> str:
-        """The line as it is written."""
+    def text(self) -> bytes:
+        """The line as it is written, with the checksum of its bytes as the last entry."""
         finite = {key: v if math.isfinite(v) else None for key, v in self.values.items()}
-        return json.dumps({**vars(self), "values": finite}) + "\n"
+        body = json.dumps({**vars(self), "values": finite}).encode()
+        return _sealed_line(body[:-1]) + b"\n"
+
+
+def _sealed_line(body: bytes) -> bytes:
+    return body + f', "crc32": "{zlib.crc32(body):08x}"}}'.encode()
+
+
+# The end of a line of `MetricLine`, and its length.
+SEALED = re.compile(rb', "crc32": "[0-9a-f]{8}"}')
+SEAL_LENGTH = len(_sealed_line(b""))
 
 
 @dataclass(frozen=True)
@@ -121,6 +142,12 @@ class ResultForm(TypedDict, total=False):
     test: dict[str, float | None]
 
 
+class ProvenanceForm(TypedDict):
+    """``provenance.json``: an entry of every process."""
+
+    processes: list[dict[str, Any]]
+
+
 def is_finished(folder: Path) -> bool:
     """Whether the run in `folder` is finished."""
     return (folder / "result.json").is_file()
@@ -158,7 +185,9 @@ def read_tables(folder: Path) -> ResultTables | None:
 
 def read_provenance(file: Path) -> list[dict[str, Any]]:
     """Entries of a ``provenance.json``, one per process, the first one first; [] without a file."""
-    return _read(file, list[dict[str, Any]]) or []
+    found = _read(file, ProvenanceForm | list[dict[str, Any]])  # a list: of the archive
+    entries = found["processes"] if isinstance(found, dict) else found or []
+    return cast("list[dict[str, Any]]", entries)
 
 
 def _read(path: Path, form: Any) -> Any:
@@ -197,8 +226,8 @@ class RunFolder:
         return is_held(self.path / "lock")
 
     def write_config(self, text: str) -> None:
-        """Write the resolved configuration (YAML text)."""
-        write_atomic(self.path / "config.yaml", text.encode())
+        """Write the resolved configuration (YAML text), sealed."""
+        write_atomic(self.path / "config.yaml", sealed_text(text.encode()))
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
@@ -208,7 +237,7 @@ class RunFolder:
         if diff:
             write_atomic(self.path / name, diff.encode())
         entries = [*before, {**entry, "diff": name if diff else None}]
-        write_json(self.path / "provenance.json", entries)
+        write_json(self.path / "provenance.json", {"processes": entries})
 
     def describe(self, description: Description) -> None:
         """Write name, tags and parameters of this run for trackers."""
@@ -218,13 +247,15 @@ class RunFolder:
         """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
         plain = {name: float(value) for name, value in values.items()}
         path = self.path / "metrics.jsonl"
-        with naming_full_disk(path), path.open("a") as file:
+        with naming_full_disk(path), path.open("ab") as file:
             file.write(MetricLine(step, kind, round(time.time(), 3), plain).text())
 
     def lines(self) -> list[MetricLine]:
         """Lines of ``metrics.jsonl``; InputError for a damaged one, but not for a cut last one."""
         path = self.path / "metrics.jsonl"
-        whole = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+        *whole, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
+        if SEALED.search(last):  # whole but for its end
+            whole.append(last)
         try:
             return MetricLine.read_all(whole) if whole else []
         except ValueError:
@@ -249,7 +280,7 @@ class RunFolder:
         found = self.lines()
         ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
         kept = (line.text() for line in found if line.step <= ends.get(line.kind, -1))
-        write_atomic(self.path / "metrics.jsonl", "".join(kept).encode())
+        write_atomic(self.path / "metrics.jsonl", b"".join(kept))
         return found
 
     def figure_path(self, name: str) -> Path:

@@ -45,12 +45,14 @@ from rgbt.runs.run_spec import (
     RunSpec,
     labels_key,
 )
+from rgbt.terminal import info
 
 # Prefixes of the name of an upstream run; a common one keeps its own seed and data set.
 PREFIX, COMMON_PREFIX = "experiment:", "common:"
 
-# Setting of an embedded data set: where the generated images are.
+# Setting of an embedded data set: where the generated images are; and of loaders, decoded ones.
 CACHE = "cache_dir"
+CACHES = (CACHE, "cache")
 
 # Setting that names the folder of another author's code.
 CHECKOUT = "model.checkout"
@@ -274,6 +276,8 @@ def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
 def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:
     """The specification of a stored run; its weights and upstream runs are left out.
 
+    Folders of caches, in which files are written, are those of the user or of `overrides`.
+
     Args:
         settings: plain values of its configuration, whose targets may be built
             (`rgbt.config.stored_config`).
@@ -284,10 +288,30 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
         InputError: overrides that do not fit.
     """
     register_resolvers()
-    config = OmegaConf.create(dict(settings))
+    typed = {word.partition("=")[0].rpartition(".")[2] for word in overrides}
+    config = OmegaConf.create(_without_caches(settings, typed))
     _override(config, overrides)
     config.model.weights = None  # the checkpoint holds them all
     return _spec_of(resolved(config), (), ()).check()
+
+
+def _without_caches(node: Any, typed: set[str]) -> Any:
+    """A copy of a stored node, in which our classes get no folder to write into.
+
+    What replaces it is not reported where it was `typed`.
+    """
+    if isinstance(node, list):
+        return [_without_caches(value, typed) for value in node]
+    if not isinstance(node, Mapping):
+        return node
+    copy = {key: _without_caches(value, typed) for key, value in node.items()}
+    is_ours = str(node.get("_target_")).startswith("rgbt.")
+    for key in CACHES if is_ours else ():
+        if copy.get(key) not in (None, "auto"):
+            if not {key, "dataset"} & typed:
+                info(f"{key}={copy[key]} of the stored configuration is not used; name your own.")
+            copy[key] = None
+    return copy
 
 
 def _override(config: DictConfig, overrides: Sequence[str]) -> None:

@@ -98,7 +98,8 @@ def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
     base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "rgbt"
     cache = Path(cache_dir or base).expanduser()
-    folder = cache / f"{plan.name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    name = plan.name.replace("/", "_")  # of a stored run: no folder outside the cache
+    folder = cache / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if folder.is_dir():
         return folder
     try:

@@ -7,23 +7,26 @@ store comes from the configuration, never from a run folder.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shlex
 import shutil
+import sqlite3
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import holding
+from rgbt.files.plain_files import check_links
 from rgbt.ranges import Text
 from rgbt.runs.folder import Description, RunFolder, read_description, shown_key
 from rgbt.runs.provenance import without_passwords
@@ -31,25 +34,31 @@ from rgbt.tracking.mlflow_upload import UploadState, is_sent, read_upload_state,
 from rgbt.tracking.mlflow_view import view_tags
 from rgbt.tracking.tracker import Link, Status, Tracking
 
+TIMEOUT = "MLFLOW_HTTP_REQUEST_TIMEOUT"
+
 # Environment variables set before mlflow is imported, unless the user has set them.
 ENVIRONMENT = {
     "DO_NOT_TRACK": "true",
     "MLFLOW_LOGGING_LEVEL": "ERROR",
     # A lost server must delay a training by seconds, not by the minutes of the defaults (7, 120).
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
+    TIMEOUT: "8",
     "GIT_PYTHON_REFRESH": "quiet",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
 
-SQLITE = "sqlite:///"
+SQLITE, ARTIFACTS = "sqlite:///", "mlartifacts"
 EXPERIMENT = "rgbt"
-# Seconds until a call ends, one with files ends, and another process must free its lock.
-CALL_S, FILE_S, LOCK_WAIT_S = 30.0, 600.0, 50.0
+# Seconds until a call to a server ends, one to a database of our own, one with files, and until
+# another process must free its lock.
+SERVER_S, CALL_S, FILE_S, LOCK_WAIT_S = 9.0, 30.0, 600.0, 50.0
 
-# Seconds that a training waits before it uses a failed store again; doubled each time.
-PAUSE_S = 300.0
+OUTSIDE = "uri: the store keeps files outside its folder, at {}; name it (uri=...) to trust it."
+
+# Seconds that a training waits before it uses a failed store again, doubled each time; it does not
+# use one again that took longer than `SLOW_S` to fail.
+PAUSE_S, SLOW_S = 300.0, 3.0
 
 EXPERIMENT_NOTE = """\
 One run per configuration and seed. mIoU, Var, region/..., class/...: test split, percent (Var:
@@ -63,19 +72,21 @@ class StoreBusyError(Exception):
 
 @dataclass(frozen=True)
 class MlflowStore:
-    """MLflow's client, the experiment, and the folder that artifacts must lie in, if any."""
+    """MLflow's client, the experiment, and the folder that files must lie in, if any."""
 
     client: Any
     experiment_id: str
     files: Path | None = None
 
     def check_files(self, artifact_uri: str) -> None:
-        """InputError where a store that nobody named would take files out of its folder."""
+        """InputError where files of a run would leave the folder of a store that nobody named."""
         address = urlparse(artifact_uri)
         is_local = address.scheme in ("", "file")
         path = Path(unquote(address.path)).resolve()
         if self.files and not (is_local and path.is_relative_to(self.files)):
-            raise InputError(f"uri: the store keeps files outside its folder, at {artifact_uri}.")
+            raise InputError(OUTSIDE.format(artifact_uri))
+        if self.files:
+            check_links(path)
 
 
 class LimitedClient:
@@ -85,10 +96,12 @@ class LimitedClient:
         set_environment()
         from mlflow import MlflowClient  # takes seconds, hence not at the top
 
-        self._client = self._within(CALL_S, MlflowClient, tracking_uri=uri)
+        is_patient = uri.startswith(SQLITE) or os.environ[TIMEOUT] != ENVIRONMENT[TIMEOUT]
+        self._limit_s = CALL_S if is_patient else SERVER_S
+        self._client = self._within(self._limit_s, MlflowClient, tracking_uri=uri)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        call, limit_s = getattr(self._client, name), FILE_S if "artifact" in name else CALL_S
+        call, limit_s = getattr(self._client, name), FILE_S if "artifact" in name else self._limit_s
         return lambda *values, **named: self._within(limit_s, call, *values, **named)
 
     def _within(self, limit_s: float, call: Callable[..., Any], *values: Any, **named: Any) -> Any:
@@ -139,6 +152,36 @@ def _create_database(database: Path, artifact_uri: str | None) -> None:
             shutil.rmtree(scratch, ignore_errors=True)
 
 
+def _take_files_along(database: Path, files: Path) -> None:
+    """Let the store of a folder that was moved or copied name the files that moved with it.
+
+    MLflow notes the absolute address of the files of every run. InputError: one lies elsewhere.
+    """
+    with closing(sqlite3.connect(database)) as connection, connection:
+        for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
+            rows = connection.execute(f"SELECT {column}, rowid FROM {table}").fetchall()
+            found = [(_address_in(files / ARTIFACTS, str(uri)), row) for uri, row in rows]
+            changed = set(found) - set(rows)
+            connection.executemany(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", changed)
+
+
+def _address_in(own: Path, uri: str) -> str:
+    """`uri` if its files are in the folder `own`, or where they moved to in it; else InputError."""
+    address = urlparse(uri)
+    path = Path(unquote(address.path))
+    if ".." not in path.parts and not address.netloc:
+        is_local = address.scheme in ("", "file")
+        # The latter is of an experiment that somebody made in the pages.
+        if (is_local and path.is_relative_to(own)) or address.scheme == "mlflow-artifacts":
+            return uri
+        _, found, rest = str(path).rpartition(f"/{ARTIFACTS}")
+        moved = Path(f"{own}{rest}")
+        is_moved = is_local and found and rest[:1] in ("", "/")
+        if is_moved and (moved.exists() or not path.exists()):
+            return moved.as_uri()
+    raise InputError(OUTSIDE.format(uri))
+
+
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Hold a lock; StoreBusyError where another process does, because a stopped one never ends."""
@@ -173,7 +216,7 @@ class MlflowTracking(Tracking):
         self.uri = f"{SQLITE}{root / 'mlflow.db'}" if uri is None else uri
         self._files = root if uri is None and artifact_uri is None else None
         if artifact_uri is None and not self.uri.startswith("http"):
-            artifact_uri = (root / "mlartifacts").as_uri()
+            artifact_uri = (root / ARTIFACTS).as_uri()
         self.artifact_uri, self.experiment = artifact_uri, experiment
         self._shown_uri = without_passwords(self.uri)
         place = f"runs_dir={root}" if uri is None else f"uri={self._shown_uri}"
@@ -213,7 +256,8 @@ class MlflowTracking(Tracking):
 
     def finish(self, status: Status) -> None:
         """Send what is new and close the run."""
-        self._guarded(status)
+        if self._quiet_until < math.inf:
+            self._guarded(status)
 
     def links(self) -> list[Link]:
         """The command that opens the pages, or that sends the run to its store."""
@@ -237,12 +281,20 @@ class MlflowTracking(Tracking):
             upload(store, folder, state, status)
         return state.run_id
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the store has answered."""
+        return self._store is not None
+
     def store(self) -> MlflowStore:
         """The open store, made where it does not exist; raises what MLflow raises."""
         if self._store is not None:
             return self._store
         if self.uri.startswith(SQLITE):
-            _create_database(Path(self.uri.removeprefix(SQLITE)), self.artifact_uri)
+            database = Path(self.uri.removeprefix(SQLITE))
+            _create_database(database, self.artifact_uri)
+            if self._files is not None:
+                _take_files_along(database, self._files)
         client = LimitedClient(self.uri)
         found = client.get_experiment_by_name(self.experiment)
         if found is None:
@@ -250,7 +302,6 @@ class MlflowTracking(Tracking):
                 client.create_experiment(self.experiment, artifact_location=self.artifact_uri)
             found = client.get_experiment_by_name(self.experiment)
         store = MlflowStore(client, found.experiment_id, self._files)
-        store.check_files(found.artifact_location)
         for name, value in {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}.items():
             if found.tags.get(name) != value:
                 client.set_experiment_tag(found.experiment_id, name, value)
@@ -258,23 +309,35 @@ class MlflowTracking(Tracking):
         return store
 
     def _state(self, folder: RunFolder) -> UploadState:
-        """What this store has of the run; nothing if the folder was sent to another one."""
+        """What this store has of the run; nothing if the folder was sent to another one.
+
+        Where the folder of runs was moved or copied, all files are sent again, to the same run.
+        """
         fresh = UploadState(self._shown_uri, self.experiment)
         try:
             state = read_upload_state(folder) or fresh
         except InputError as error:  # `upload` finds the run by its key and sends everything
             sys.stderr.write(f"rgbt: {error}\n")
             return fresh
-        return state if (state.uri, state.experiment) == (fresh.uri, fresh.experiment) else fresh
+        if (state.uri, state.experiment) == (fresh.uri, fresh.experiment):
+            return state
+        is_own = self._files is not None and state.uri.endswith("/mlflow.db")
+        is_moved = is_own and state.experiment == fresh.experiment
+        return replace(state, uri=fresh.uri, sent=0.0) if is_moved else fresh
 
     def _guarded(self, status: Status) -> None:
         """Sync; what the store raises becomes a line on stderr, once."""
+        set_environment()
+        import mlflow  # noqa: F401 - its seconds are no delay of the store
+
+        began = time.monotonic()
         try:
             self.sync(self._folder, status)
         except InputError as error:  # a damaged file of the run
             sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
         except Exception as error:  # Catches everything: a dead tracker must never stop a training.
-            self._quiet_until = time.monotonic() + self._pause_s
+            now = time.monotonic()
+            self._quiet_until = math.inf if now - began > SLOW_S else now + self._pause_s
             self._pause_s *= 2
             if not self._warned:
                 sys.stderr.write(

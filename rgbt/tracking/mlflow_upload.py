@@ -193,8 +193,9 @@ def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, content: 
     seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
     start, tags, name = round(1000 * seconds), content.identity, content.description.name
     found = store.client.search_runs([store.experiment_id], f"attributes.start_time = {start}")
-    # Compared here: MLflow's search cannot quote every path.
-    run = next((each for each in found if tags.items() <= each.data.tags.items()), None)
+    # Compared here: MLflow's search cannot quote every path. A store of one folder moves with it.
+    known = {key: tags[key] for key in tags if not (store.files and key == "rgbt.folder")}
+    run = next((each for each in found if known.items() <= each.data.tags.items()), None)
     run = run or store.client.create_run(store.experiment_id, start, tags, name[:NAME_LENGTH])
     state.run_id, state.steps, state.sent = run.info.run_id, {}, 0.0
     write_upload_state(folder, state)

@@ -66,7 +66,7 @@ def main(options: Options, overrides: list[str]) -> int:
                 raise
             failed += 1
             info(f"{folder.path} was not sent ({reason_of(error)}).")
-            if isinstance(error, StoreBusyError | TimeoutError):
+            if isinstance(error, StoreBusyError | TimeoutError) or not tracking.is_open:
                 break  # waited for once, not for every run
     sys.stdout.write(f"open MLflow  {tracking.ui_command()}\n")
     return 1 if failed else 0

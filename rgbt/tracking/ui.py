@@ -23,8 +23,9 @@ from annotated_types import Interval
 from rgbt.checks import InputError, RunError
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.files.plain_files import check_links, inside
 from rgbt.runs.provenance import without_passwords
-from rgbt.tracking.mlflow_store import EXPERIMENT, SQLITE, MlflowTracking, reason_of
+from rgbt.tracking.mlflow_store import ARTIFACTS, EXPERIMENT, SQLITE, MlflowTracking, reason_of
 from rgbt.tracking.mlflow_view import view_path
 
 HOST = "127.0.0.1"
@@ -52,8 +53,12 @@ def main(options: Options, overrides: list[str]) -> int:
     database = Path(tracking.uri.removeprefix(SQLITE))
     if tracking.uri.startswith(SQLITE) and not database.is_file():
         raise InputError(f"runs_dir={options.runs_dir}: there is no MLflow store {database}.")
+    if options.uri is None:  # the pages show every file
+        check_links(inside(options.runs_dir / ARTIFACTS, options.runs_dir))
     try:
         page = view_path(tracking.store().experiment_id)
+    except InputError:
+        raise
     except Exception as error:  # The border to a store that may fail in any way.
         raise RunError(f"uri={without_passwords(tracking.uri)}: {reason_of(error)}") from error
     if tracking.uri.startswith("http"):

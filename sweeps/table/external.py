@@ -24,6 +24,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
 from rgbt.config.options import with_home
 from rgbt.files.atomic import write_atomic
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.pair_list import PAIR_LIST
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
@@ -136,7 +137,7 @@ class ExternalRun:
             file.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(file, OmegaConf.to_yaml(OmegaConf.create(plain[group])).encode())
         write_atomic(folder / "external.json", text.encode())
-        write_atomic(folder / "provenance.json", json.dumps([{**code(), "diff": None}]).encode())
+        write_json(folder / "provenance.json", {"processes": [{**code(), "diff": None}]})
         return cls(given, row, config, arguments, folder)
 
     def outcome(self, table: Table, trust: str) -> Outcome:

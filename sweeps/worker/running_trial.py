@@ -21,6 +21,8 @@ from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.processes import LocalJob, failure_reason
 from sweeps.worker.run_store import RunStore
 
+# Settings of a run that its evaluations get, too.
+FOLDERS = ("dataset.root=", "dataset.cache_dir=")
 LOGS = ".logs"  # Folder inside the folder of runs: output of the processes, one file per run
 
 # Gets a line of the selection split; returns why the trial is pruned, or "".
@@ -177,8 +179,8 @@ class RunningTrial:
             *arguments,
             out if evaluation.frames is None else f"runs_dir={result.folder.parent}",
             *([f"trust={self.trust}"] if self.trust else []),
-            # The run may come from a machine with another data folder.
-            *(word for word in run.overrides if word.startswith("dataset.root=")),
+            # The run may come from a machine with other folders.
+            *(word for word in run.overrides if word.startswith(FOLDERS)),
         )
         reason = yield from self._run(command, result.key)
         if reason is not None or not evaluation.is_stored(result):

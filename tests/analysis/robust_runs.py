@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import Description, RunFolder
 from tests.analysis.counts import counts_of, result_of
@@ -40,7 +40,7 @@ def write_levels(folder: Path, scores: Scores) -> Path:
         mark = row if row == "clean" or row.startswith("features") else f"{row}-{severity:g}"
         right(percent).save(folder / f"{mark}.npz")
         made = {"row": row, "title": title, "unit": unit, "severity": severity}
-        (folder / f"{mark}.json").write_text(json.dumps(made))
+        write_json(folder / f"{mark}.json", made)
     return folder
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import re
 import shutil
 import zipfile
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from analysis import archive
 from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.files.plain_files import write_json
@@ -162,6 +164,21 @@ def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: int 
         unpack(path, tmp_path / "unpacked")
     assert list((tmp_path / "unpacked").iterdir()) == []
     assert not (tmp_path / "outside.txt").exists()
+
+
+def test_archive_that_fills_the_memory_is_refused(
+    run: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = archived_in(tmp_path)
+    with zipfile.ZipFile(path) as members:
+        total = sum(each.file_size for each in members.infolist())
+    for most in (total - 1, total):  # members; texts, which are longer
+        monkeypatch.setattr(archive, "MOST", most)
+        with pytest.raises(InputError, match=f"damaged .it unpacks to more than {most} bytes"):
+            unpack(path, tmp_path / "unpacked")
+    assert archive._decompressed(lzma.compress(bytes(total))) == bytes(total)
+    with pytest.raises(ValueError, match="unpacks to more"):
+        archive._decompressed(lzma.compress(bytes(total + 1)))
 
 
 def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:

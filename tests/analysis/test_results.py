@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from analysis.results import (
 )
 from rgbt.checks import InputError
 from rgbt.evaluation import robustness
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
 from rgbt.runs.folder import Description, RunFolder, counts_name
@@ -47,7 +47,7 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     run.describe(Description(f"{group} seed={seed}", tags, {}))
     some(seed).save(run.path / counts_name("test"))
     replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
-    (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
+    write_json(run.path / "mlflow.json", {"run_id": f"mlflow-{key}"})
     if finished:
         run.finish(result_of(key, some(seed)))
     return run.path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +9,7 @@ import pytest
 
 from rgbt.assembly import load_run
 from rgbt.assembly.session import names_key
+from rgbt.files.plain_files import write_json
 
 
 def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamespace:
@@ -29,7 +29,7 @@ def test_other_splits_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     load_run._warn_of_other_splits(tmp_path, other)
     marker.write_text("{")
     load_run._warn_of_other_splits(tmp_path, other)
-    marker.write_text(json.dumps({"names": names_key(before), "files": "x"}))
+    write_json(marker, {"names": names_key(before), "files": "x"})
     for each in (before, session(None, train=("a", "c"), test=("b",))):
         load_run._warn_of_other_splits(tmp_path, each)
     assert warnings == [], "unknown, the same, a data set without name"

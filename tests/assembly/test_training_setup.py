@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from rgbt.data import rare_classes
 from rgbt.data.labels import classes_in
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.engine.device import Recomputed
+from rgbt.files.plain_files import write_json
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify
@@ -121,7 +121,7 @@ def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Pat
         "fingerprint": dataset.fingerprint(),
         **changes,
     }
-    (folder / "pseudo_labels.json").write_text(json.dumps(said))
+    write_json(folder / "pseudo_labels.json", said)
     return folder
 
 

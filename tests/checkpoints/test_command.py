@@ -19,7 +19,7 @@ from rgbt.config.compose import available
 from rgbt.weights import entry
 from tests.checkpoints.files import network, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
-from tests.commands import Call
+from tests.commands import Call, edit_config
 from tests.models import golden
 
 
@@ -91,9 +91,7 @@ def test_export_and_inspect(run: Path, tmp_path: Path, call: Call) -> None:
     assert re.search(rf"note run +{run.name}\n", out)
     assert '"rgb_order": "rgb"' in out
     # The authors' code feeds or evaluates the network otherwise.
-    stored = (run / "config.yaml").read_text()
-    changed = stored.replace("final_activation: true", "final_activation: false")
-    (run / "config.yaml").write_text(changed)
+    edit_config(run, "final_activation: true", "final_activation: false")
     words = (f"run={run}", "format=released", f"out={tmp_path / 'b.pth'}")
     assert "which uses model.final_activation=true" in call(entry, "export", *words)[2]
 

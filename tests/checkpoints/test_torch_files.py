@@ -32,7 +32,7 @@ from rgbt.engine.checkpoint import (
 )
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
-from tests.commands import Call, Trained, short
+from tests.commands import Call, Trained, edit_config, short
 from tests.damage import damaged
 
 
@@ -172,6 +172,10 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     config = folder / "config.yaml"
     stored = config.read_text()
     config.write_text(stored.replace("seed: 1\n", "seed: 3\n", 1))
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert (code, "config.yaml cannot be read" in err, "checksum" in err) == (2, True, True)
+    config.write_text(stored)
+    edit_config(folder, "seed: 1\n", "seed: 3\n")
     code, _, err = call(evaluate.entry, *evaluated)
     assert (code, "config.yaml was changed after training" in err) == (2, True)
     config.write_text(stored)

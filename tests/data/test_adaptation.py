@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES, MFNet
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabelled, PseudoLabels, Unlabelled
 from rgbt.evaluation.images import label_map_of
+from rgbt.files.plain_files import write_json
 from rgbt.types import VIEWS
 from tests.data.layouts import refused
 
@@ -196,7 +196,7 @@ def write(folder: Path, name: str, label: np.ndarray, confidence: np.ndarray) ->
 
 def say(folder: Path, **others: Any) -> None:
     manifest = {"format": FORMAT, "classes": CLASSES, "digest": "abc", **others}
-    (folder / "pseudo_labels.json").write_text(json.dumps(manifest))
+    write_json(folder / "pseudo_labels.json", manifest)
 
 
 def test_labels_and_confidences_are_read(folder: Path) -> None:

@@ -176,11 +176,11 @@ def test_measure_stopped_resumes_and_leaves_no_wrong_identity(
     measure(opened(), "test", noise(), tmp_path)
     assert later.calls == [(10.0, "rgbt"), (50.0, "rgbt")]
 
-    def killed(path: Path, content: bytes) -> None:
+    def killed(path: Path, content: object) -> None:
         raise KeyboardInterrupt
 
     # Killed between the two files: the identity of counts is removed before they change.
-    monkeypatch.setattr("rgbt.evaluation.robustness.write_atomic", killed)
+    monkeypatch.setattr("rgbt.evaluation.robustness.write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         measure(opened(model=other_weights()), "test", [], tmp_path)
     assert not (tmp_path / "clean.json").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ def test_values_are_those_of_omegaconf() -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        *(("a: {<<: *b}", "undefined alias"), ("a: " + "9" * 5000, "digits")),
+        *(("a: {<<: *b}", "undefined alias"), ("a: " + "9" * 5000, "5000 char")),
         ("a: !!python/object/apply:os.system [touch x]", "the tag 'tag:yaml.org,2002:python"),
         *(
             ("a: !!binary eA==", "the tag"),
@@ -34,14 +35,31 @@ def test_values_are_those_of_omegaconf() -> None:
         *(("a: 1\nb: 2\na: 3", "duplicate key 'a'"), ("{1: 2, 0x1: 3}", "duplicate key")),
         *(("? [1]\n: 2", "unhashable key"), ("a: [", "line 2"), ("a: \x00", "control characters")),
         ("--- a\n--- b", "but found another document"),
+        *(("a: &a 1\nb: *a", "line 1: found an alias"), ("a: &a [*a]", "found an alias")),
+        *(("a: {<<: {b: 1}}", "2002:merge"), ("? &a b\n: *a", "found an alias")),
+        # In hexadecimal, and to base 60, whose square of the length and overflow take a while.
+        *(("a: 0x" + "F" * 5000, "5002 char"), ("a: " + "1:" * 200 + "1.5", "403 char")),
+        *(("[" * 51 + "a" + "]" * 51, "levels"), ("[" * 2000, "nesting depth")),
     ],
-    ids=range(12),
+    ids=range(20),
 )
 def test_what_is_no_plain_data_is_refused(text: str, reason: str) -> None:
     with pytest.raises(InputError, match=r"^some\.yaml") as refused:
         parse_yaml(text, "some.yaml")
     assert reason in str(refused.value)
     assert len(str(refused.value)) < 300
+
+
+def test_aliases_of_aliases_are_refused_in_no_time() -> None:
+    """Of 9 levels of 9 aliases: 3.5e9 values."""
+    lines = ["a0: &a0 [x]"]
+    lines += [f"a{n}: &a{n} [{', '.join(9 * [f'*a{n - 1}'])}]" for n in range(1, 11)]
+    began = time.process_time()
+    with pytest.raises(InputError, match="found an alias"):
+        parse_yaml("\n".join(lines), "some.yaml")
+    assert time.process_time() - began < 1
+    assert parse_yaml("[" * 50 + "a" + "]" * 50, "x"), "as deep as may be"
+    assert parse_yaml("a: &unused 1", "x") == {"a": 1}
 
 
 def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.metrics import archive
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import Counts, check_same_means, convention
 
@@ -116,3 +118,17 @@ def test_other_files_are_refused_and_nothing_in_them_runs(tmp_path: Path) -> Non
         Counts.load(path)
     with pytest.raises(InputError, match="the file of counts .* does not exist"):
         Counts.load(tmp_path / "none.npz")
+
+
+def test_a_file_of_too_many_bytes_is_refused_before_they_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    example().save(tmp_path / "counts.npz")
+    with zipfile.ZipFile(tmp_path / "counts.npz") as file:
+        size = sum(member.file_size for member in file.infolist())
+    monkeypatch.setattr(archive, "MAX_BYTES", size)
+    assert Counts.load(tmp_path / "counts.npz").names == example().names
+    monkeypatch.setattr(archive, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", None)
+    with pytest.raises(InputError, match="it holds"):
+        Counts.load(tmp_path / "counts.npz")

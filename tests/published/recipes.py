@@ -22,7 +22,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rgbt.files.yaml_files import read_yaml
+import yaml
+
+from rgbt.files.yaml_files import _Loader
 
 FOLDER = Path(__file__).parent
 FILES = ("crm", "networks", "cmnext", "dinov2", "thesis", "self_training", "data", "run")
@@ -132,8 +134,14 @@ def flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value.rpartition(".")[2] if key == "_target_" else value
 
 
+class _WithAliases(_Loader):
+    """Reads aliases, which strangers' files may not have: several sections share experiments."""
+
+    construct_object = _Loader.__mro__[1].construct_object
+
+
 def _file(name: str) -> Any:
-    return read_yaml(FOLDER / f"{name}.yaml")
+    return yaml.load((FOLDER / f"{name}.yaml").read_text(), _WithAliases)  # noqa: S506
 
 
 def _section(group: str, text: Mapping[str, Any]) -> Section:

@@ -17,6 +17,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import is_held, write_atomic
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import (
     Description,
@@ -63,12 +64,16 @@ def test_truncate_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
         folder.append(step, "train", {"loss": 1.0 / step, "odd": math.nan})
     folder.append(20, "test", {"mIoU": 0.5})
     path = tmp_path / "metrics.jsonl"
-    with path.open("a") as file:
-        file.write('{"step": 40, "ki')  # cut short by a crash
-    before = folder.lines()
+    before, whole = folder.lines(), path.read_bytes()
+    path.write_bytes(whole[:-1] + b"?")
+    with pytest.raises(InputError, match=r"line 4: it does not match its checksum"):
+        folder.lines()
+    for cut in (whole[:-1], whole + b'{"step": 40, "ki'):  # cut short by a crash
+        path.write_bytes(cut)
+        assert str(folder.lines()) == str(before), "NaN is not equal to itself"
     assert [(line.step, line.kind) for line in before[2:]] == [(30, "train"), (20, "test")]
     assert json.loads(path.read_text().splitlines()[0])["values"] == {"loss": 0.1, "odd": None}
-    assert str(folder.truncate_after(20)) == str(before), "NaN is not equal to itself"
+    assert str(folder.truncate_after(20)) == str(before)
     after = folder.lines()
     assert [(line.step, line.kind) for line in after] == [(10, "train"), (20, "train")]
     assert (after[1].time, math.isnan(after[1].values["odd"])) == (before[1].time, True)
@@ -94,9 +99,9 @@ def test_a_damaged_line_is_named(tmp_path: Path, text: bytes) -> None:
     "text",
     [
         *("{", "[" * 100_000, '{"datasft": "0123"}', '{"steps": "9"}'),
-        '{"dataset": "0123", "crc32": "00000000"}',
+        *('{"dataset": "0123", "crc32": "00000000"}', '{"dataset": "0123"}'),
     ],
-    ids=range(5),
+    ids=range(6),
 )
 def test_a_damaged_result_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "result.json").write_text(text)
@@ -255,7 +260,7 @@ def test_set_aside_keeps_finished_runs_outside_their_group(tmp_path: Path) -> No
     assert not (tmp_path / "abc").exists()
     assert read_result(paths[0]) == {"key": "abc"}
     assert find_run("replaced/abc-1", tmp_path) == paths[0]
-    (paths[1] / "mlflow.json").write_text('{"run_id": "f00"}')
+    write_json(paths[1] / "mlflow.json", {"run_id": "f00"})
     assert find_run("f00", tmp_path) == paths[1]
 
     present = finished(tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
+from rgbt.files.plain_files import write_json
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import load_spec, specify
 
@@ -71,7 +71,7 @@ def test_key_counts_weights_and_pseudo_labels_by_content(tmp_path: Path) -> None
     for path, folder, text in zip(files, folders, ("one", "one", "other"), strict=True):
         path.write_text(text)
         folder.mkdir()
-        (folder / "pseudo_labels.json").write_text(json.dumps({"digest": text}))
+        write_json(folder / "pseudo_labels.json", {"digest": text})
     for setting, named in (("model.weights", files), ("domains.target.labels", folders)):
         one, same, other = (key_of("sh_both", f"{setting}={each}") for each in named)
         assert one == same

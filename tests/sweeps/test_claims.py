@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rgbt.files.plain_files import write_json
 from sweeps.claims import entry as claims
 from sweeps.reproduce import entry as reproduce
 from sweeps.table.request import UNTIL_DECIDED
@@ -56,10 +56,10 @@ def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
             folder.mkdir(parents=True)
             own = {"rgbt.experiment": "baseline", "rgbt.seed": str(seed), **(tags or {})}
             described = {"name": run.key, "tags": own, "params": {}}
-            (folder / "run.json").write_text(json.dumps(described))
+            write_json(folder / "run.json", described)
             replace(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
             result = {"key": run.key, "dataset": dataset, "test": {"mIoU": share / 100}}
-            (folder / "result.json").write_text(json.dumps(result))
+            write_json(folder / "result.json", result)
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.data.predictions import FormatOptions
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.types import MaskPair, Sample
 from tests.analysis.figures.drawn import CLASSES, PALETTE, texts
@@ -226,7 +227,7 @@ def test_pairs_that_do_not_fit_are_refused(framed: Path, tmp_path: Path) -> None
     with pytest.raises(InputError, match="there is no prediction"):
         opened(framed, methods=f"A:{tmp_path}").read("00000D")
     listed = json.loads((framed / "pairs" / "pairs.json").read_text())
-    (tmp_path / "pairs.json").write_text(json.dumps(listed | {"complete": False}))
+    write_json(tmp_path / "pairs.json", listed | {"complete": False})
     with pytest.raises(InputError, match="was interrupted; rerun its command"):
         opened(framed, pairs=str(tmp_path))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import pytest
 
 from rgbt.files.atomic import holding
-from rgbt.runs.folder import RunFolder
+from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.evaluation import ExtraEvaluation
@@ -289,9 +288,9 @@ def test_running_trial_reports_whole_lines_once(tmp_path: Path) -> None:
     run = RunFolder(tmp_path / KEY)
     run.append(1, "train", {"loss": 2.0})
     run.append(2, "val", {"mIoU": 0.5, "class/car": math.nan})
-    text = json.dumps({"step": 3, "kind": "val", "time": 0.0, "values": {"mIoU": 0.6}})
-    with (run.path / "metrics.jsonl").open("a") as file:
-        for part, seen, score in ((text[:20], [2], 0.5), (text[20:] + "\n", [2, 3], 0.6)):
+    text = MetricLine(3, "val", 0.0, {"mIoU": 0.6}).text()
+    with (run.path / "metrics.jsonl").open("ab") as file:
+        for part, seen, score in ((text[:20], [2], 0.5), (text[20:], [2, 3], 0.6)):
             file.write(part)
             file.flush()
             assert bench.work.advance() is None
