@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.files.plain_files import write_json
 from rgbt.runs.naming import VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
@@ -217,7 +218,7 @@ def test_estimated_seconds_is_median_of_untrained_over_workers(tmp_path: Path) -
     known = []
     for seconds in (10, 20, 90):
         folder = finish(tmp_path / str(seconds)).path
-        (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
+        write_json(folder / "result.json", {"seconds_of_last_process": seconds})
         known.append(Outcome(Point("p", ()), "finished", results=(RunResult(folder),)))
     left: list[Any] = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
     assert [estimated_seconds([*known, *left], workers) for workers in (1, 2)] == [40.0, 20.0]
