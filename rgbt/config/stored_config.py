@@ -48,7 +48,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def settings_of(plain: Any, source: str) -> dict[str, Any]:
-    """`plain`; InputError if it is no mapping with text as keys or has an interpolation."""
+    """`plain`; InputError if it is no mapping with texts as keys or has an interpolation."""
     if not isinstance(plain, dict):
         raise InputError(f"{source}: expected a mapping of keys and values, got {_shown(plain)}.")
     for key, value in _walk(plain):
@@ -140,7 +140,7 @@ def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted key and value of everything below `node`, which is at most 50 levels deep."""
     parts = dict(enumerate(node)) if isinstance(node, list) else node
     for key, value in parts.items() if isinstance(parts, Mapping) else ():
-        if not isinstance(key, str) and parts is node:
+        if not isinstance(key, str | int):  # a number is a value of a label, in `dataset.ids`
             raise InputError(f"'{_shown(path)}': the key {_shown(key)} is not text.")
         dotted = f"{path}.{key}" if path else str(key)
         yield dotted, value

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
-from rgbt.config.compose import compose
+from rgbt.config.compose import available, compose
 from rgbt.config.stored_config import (
     check_targets,
     parse_trust,
@@ -20,6 +20,8 @@ from rgbt.config.stored_config import (
     shipped_targets,
     targets,
 )
+from rgbt.files.yaml_files import parse_yaml
+from rgbt.runs.specify import requested_run
 from tests.commands import Call, assert_one_sentence
 
 LAB = "import os\nfrom pathlib import Path\nPath(__file__).with_suffix('.imported').touch()\n" + (
@@ -105,13 +107,23 @@ def test_trust_is_a_list_of_dotted_names() -> None:
             parse_trust(text)
 
 
+@pytest.mark.parametrize("dataset", sorted({*available("dataset")} - {"folder", "video"}))
+def test_every_data_set_has_a_run_whose_settings_are_read_again(dataset: str) -> None:
+    """Also one whose labels are numbers by class (`dataset.ids`)."""
+    words = ("+experiment=mfnet", f"dataset={dataset}", "scale=paper")
+    run = requested_run(compose(words), words)
+    assert len(run.key) == 12
+    text = OmegaConf.to_yaml(OmegaConf.create(dict(run.plain)))
+    assert settings_of(parse_yaml(text, "store"), "store") == run.plain
+
+
 @pytest.mark.parametrize(
     ("plain", "reason"),
     [
         ([1], "expected a mapping"),
         ({"a": "${oc.env:HOME}"}, "'a' is an interpolation"),
         ({"a": [{"b": "x ${px:64}"}]}, "'a.0.b'"),
-        ({"a": {1: 2}}, "is not text"),
+        ({"a": {1.5: 2}}, "is not text"),
         ({"model": "os.system"}, "'model' must be a mapping"),
     ],
 )
