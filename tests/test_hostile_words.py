@@ -66,7 +66,10 @@ def test_a_word_that_acts_is_refused_by_name(kind: str) -> None:
 
 
 def test_words_of_settings_are_taken() -> None:
-    check_words([*PLAIN, "optimizer.lr=-1e-3", "pretrained.cmx=/a/b.pth"], "the tag")
+    more = ("optimizer.lr=-1e-3", "pretrained.cmx=/a/b.pth", "masker.patch_size=${px:16}")
+    check_words([*PLAIN, *more], "the tag")
+    with pytest.raises(InputError):
+        check_words(["masker.patch_size=${px:${oc.env:HOME}}"], "the tag")
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
 
 # The key of a setting or group; what in any value acts; what in that of a group is a place.
 KEY = re.compile(r"[a-z_]\w*([./][a-z_]\w*)*", re.IGNORECASE | re.ASCII)
-ACTS = re.compile(r"\$\{|_target_|[\x00-\x1f\x7f]")
+ACTS = re.compile(r"\$\{(?!px:\d+\})|_target_|[\x00-\x1f\x7f]")
 PLACE = re.compile(r"^[\"']?[/~]|(^|/)\.\.(/|$)|://")
 
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
