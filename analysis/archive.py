@@ -391,10 +391,11 @@ def _compare(path: Path, stored: RunResult) -> Compared:
     before, now, none = flatten(stored.settings), flatten(spec.plain), object()
     keys = sorted(filter(is_in_key, before.keys() | now.keys()))
     differing = [key for key in keys if before.get(key, none) != now.get(key, none)]
-    if not differing and spec.is_run(stored):
+    if not differing and (spec.names_files or spec.key == stored.key):
         return path, "same", "", spec
-    # Nothing says how an upstream run differs.
+    # Nothing says how an upstream run differs. A key of a stranger's files is not computed.
     is_added = bool(differing) and all(key not in before for key in differing)
+    is_added &= not spec.names_files
     reason = ", ".join(differing) or "a run that it depends on"
     return path, "added" if is_added else "changed", reason, spec
 

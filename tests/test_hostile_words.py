@@ -46,12 +46,20 @@ HOSTILE = {
     "target": "+evil={{_target_: " + SHELL + ", command: touch {root}/mark}}",
     "option": "--config-dir={root}/evil",
     "trust": "trust=evil",
+    "class": "model._target_=evil.f",
+    "checkout": "model.checkout={root}/evil",
+    "link": "trainer.x=[evil](https://evil.example)",
+    "controls": "trainer.x=evil\x9b31m\u202e",
+    "seeds": "seeds._target_=evil",
 }
 # Settings instead of words: scale, experiment, and the run that the weights come from.
 SETTINGS = {
     "scale": ("\n  name: demo", "\n  name: ../../evil"),
     "name": ("\nname: crm", "\nname: ../../../evil"),
     "upstream": ("weights: null", "weights: experiment:../../../evil/best.pt"),
+    "seeds=": ("rgbt.runs.run_spec.Seeds", "rgbt_evil.made"),
+    "seeds.start=": ("start: common", "start: {_target_: rgbt_evil.made}"),
+    "model.weights=": ("weights: null", "weights: {root}/evil/pipe"),
 }
 SAMPLER = "  sampler: uniform\n"
 PLAIN = ("masker=crm", "trainer.max_steps=9", "~dataset.splits.test_day", "model/inputs=unit")
@@ -67,6 +75,7 @@ def test_a_word_that_acts_is_refused_by_name(kind: str) -> None:
 
 def test_words_of_settings_are_taken() -> None:
     more = ("optimizer.lr=-1e-3", "pretrained.cmx=/a/b.pth", "masker.patch_size=${px:16}")
+    more += ("pretrained=/a/b.pth", "dataset.ids.7=person", "+dataset.lists.test-night=a.txt")
     check_words([*PLAIN, *more], "the tag")
     with pytest.raises(InputError):
         check_words(["masker.patch_size=${px:${oc.env:HOME}}"], "the tag")
@@ -82,6 +91,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, trained: Trained) -> Path:
     mark = ACTS.format(str(root / "mark"))
     (root / "evil").mkdir()
     (root / "evil" / "masker.yaml").write_text("evil: 1\n")
+    (root / "rgbt_evil.py").write_text(f"{mark}def made(**_):\n    pass\n")
     (root / "evil.yaml").write_text("# @package _global_\nevil: 1\n")
     words = [word.format(key=done.name, root=root) for word in HOSTILE.values()]
     for number, word in enumerate([*words, *SETTINGS]):
@@ -102,6 +112,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, trained: Trained) -> Path:
         write_json(folder / "result.json", {**result, "key": key})
         config = (folder / "config.yaml").read_text()
         old, new = SETTINGS.get(word, ("", ""))
+        new = new.replace("{root}", str(root))
         assert old in config
         # Archived runs lack a setting of today, so that rekey renames them.
         assert SAMPLER in config
@@ -164,7 +175,7 @@ def test_no_command_composes_a_stored_word(
     code, out, err = call(entry, *[word.format(*keys) for word in words], *runs)
     assert code == expected, err
     assert not [word for word in composed if "evil" in word or word.startswith("hydra")]
-    assert not {each for each in sys.modules if each.startswith(("runs", "evil"))}
+    assert not {each for each in sys.modules if each.startswith(("runs", "evil", "rgbt_evil"))}
     assert not list(tmp_path.rglob("mark"))
     assert SECRET not in out + err
     for path in archived(root / "results"):

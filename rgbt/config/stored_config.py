@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, split_list
 from rgbt.config.component import constructor
-from rgbt.config.compose import conf_dir, top_level
+from rgbt.config.compose import conf_dir, groups, top_level
 from rgbt.files.yaml_files import read_yaml
 
 NAMED = re.compile(r"_target_:\s*[\"']?(rgbt\.[\w.]+)", re.ASCII)
@@ -28,8 +28,8 @@ DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
 EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
 
 # The key of a setting or group; what in any value acts; what in that of a group is a place.
-KEY = re.compile(r"[a-z_]\w*([./][a-z_]\w*)*", re.IGNORECASE | re.ASCII)
-ACTS = re.compile(r"\$\{(?!px:\d+\})|_target_|[\x00-\x1f\x7f]")
+KEY = re.compile(r"[a-z_]\w*([./][\w-]+)*", re.IGNORECASE | re.ASCII)
+ACTS = re.compile(r"\$\{(?!px:\d+\})|_target_|\]\(|://")
 PLACE = re.compile(r"^[\"']?[/~]|(^|/)\.\.(/|$)|://")
 
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
@@ -115,8 +115,9 @@ def check_words(words: Iterable[str], source: str) -> None:
         key, equals, value = word.lstrip("+~").partition("=")
         is_plain = KEY.fullmatch(key) and (equals or word.startswith("~"))
         is_hydra = key.split(".")[0].split("/")[0] == "hydra"
-        is_place = "." not in key and PLACE.search(value)
-        if not is_plain or is_hydra or key == "trust" or is_place or ACTS.search(value):
+        is_place = key.partition("/")[0] in (*groups(), "experiment") and PLACE.search(value)
+        acts = is_hydra or key == "trust" or key.endswith(".checkout") or ACTS.search(word)
+        if not is_plain or is_place or acts or not word.isprintable():
             raise InputError(f"{source}: the word {_shown(word)} is not one of a setting.")
 
 

@@ -17,8 +17,8 @@ from rgbt.metrics.details import details_of, regions_of
 from rgbt.metrics.metric import Absent, number_of_regions
 from rgbt.metrics.names import DAY, NIGHT
 
-# What partition, data set, split and run are written with; they are parts of names of files.
-WORD = re.compile(r"[\w.+-]*")
+# What partition, data set and run are written with, and what no text of counts has.
+WORD, CONTROL = re.compile(r"[\w.+-]*"), re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 # More than the pixels of any image, in the units of `rgbt.metrics.details`; sums do not overflow.
 MOST = 2**40
@@ -153,12 +153,15 @@ class Counts:
         ends = (self.counts.min(), self.counts.max()) if self.counts.size else (0, 0)
         if ends[0] < 0 or ends[1] > MOST:
             raise ValueError(f"counts: expected numbers of pixels, got {ends[0]} to {ends[1]}.")
-        for key in ("partition", "dataset", "split", "run"):
+        for key in ("partition", "dataset", "run"):
             if not WORD.fullmatch(getattr(self, key)):
                 raise ValueError(f"{key}: expected letters, digits and _.+-.")
-        for key in ("names", "classes"):
-            texts = getattr(self, key)
-            if len(set(texts)) < len(texts) or not all(text.isprintable() for text in texts):
+        for key, texts in (
+            ("names", self.names),
+            ("classes", self.classes),
+            ("split", [self.split]),
+        ):
+            if len(set(texts)) < len(texts) or any(map(CONTROL.search, texts)):
                 raise ValueError(f"{key}: expected different texts without control characters.")
 
     def _take(self, indices: list[int]) -> Counts:

@@ -153,19 +153,28 @@ class RunResult:
             raise InputError(
                 f"{path} has counts of the run {counts.run}, not of {self.key}; {advice}."
             )
+        if protocol_of(counts.partition) and counts.counts.shape[1] % (len(counts.classes) + 1):
+            raise InputError(f"{path} has other rows than {counts.partition}; {advice}.")
         result = read_result(self.folder)
         if result is None or counts.dataset != result.get("dataset"):
-            if result is not None and path.parent == self.folder:
+            # A selection may have been made before files of the data set changed.
+            if result is not None and path.parent == self.folder and counts.split == "test":
                 raise InputError(f"{path} has counts of other images than the run; {advice}.")
             return
         first = self.folder / counts_name(counts.split)
         if path == first or not first.is_file() or protocol_of(counts.partition):
             return
         own = Counts.load(first)
-        if (own.names, own.classes) != (counts.names, counts.classes):
+        # Unreadable images may have been skipped, once or both times.
+        names = [name for name in counts.names if name in set(own.names)]
+        is_part = len(names) in (len(own.names), len(counts.names))
+        if not is_part or own.classes != counts.classes:
             raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")
+        mine, others = (each.select(names).labelled() for each in (own, counts))
+        # Labels that are counted at another size have other numbers of pixels.
         is_alike = own.partition == counts.partition
-        if is_alike and not np.array_equal(own.labelled(), counts.labelled()):
+        is_alike = is_alike and np.array_equal(mine.sum((1, 2)), others.sum((1, 2)))
+        if is_alike and not np.array_equal(mine, others):
             raise InputError(f"{path} has counts of other labels than {first.name}; {advice}.")
 
     def check(self) -> None:

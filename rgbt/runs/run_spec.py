@@ -272,6 +272,22 @@ class RunSpec:
         return model.get("_target_") != EXTERNAL or bool(checkout_code(model))
 
     @property
+    def names_files(self) -> bool:
+        """Whether the key depends on files of its own, or of a run upstream: weights, labels, code.
+
+        Such a stored run is told by its settings, because a stranger's files are not opened.
+        """
+        is_external = self.plain["model"].get("_target_") == EXTERNAL
+        has_weights = self.weights is not None and self.dependency(WEIGHTS) is None
+        places = (self.plain["domains"][name] for name in ("source", "target"))
+        names = {place["labels"] for place in places if place}
+        has_labels = any(
+            name not in (GIVEN, NONE) and not str(name).startswith("experiment:") for name in names
+        )
+        of_upstream = any(each.run.names_files for each in self.dependencies)
+        return is_external or has_weights or has_labels or of_upstream
+
+    @property
     def drawn(self) -> SourceSeeds:
         """The seed of every source of random draws."""
         own = (self.seeds.weights, self.seeds.order, self.seeds.masks)

@@ -31,7 +31,7 @@ from rgbt.config.compose import (
     resolved,
     top_level,
 )
-from rgbt.config.stored_config import KEY
+from rgbt.config.stored_config import KEY, targets
 from rgbt.config.values import check_value
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.ranges import Seed
@@ -43,6 +43,7 @@ from rgbt.runs.run_spec import (
     CheckpointFile,
     Dependency,
     RunSpec,
+    Seeds,
     labels_key,
 )
 from rgbt.terminal import info
@@ -53,6 +54,8 @@ PREFIX, COMMON_PREFIX = "experiment:", "common:"
 # Setting of an embedded data set: where the generated images are; and of loaders, decoded ones.
 CACHE = "cache_dir"
 CACHES = (CACHE, "cache")
+
+SEEDS = f"{Seeds.__module__}.{Seeds.__qualname__}"
 
 # Setting that names the folder of another author's code.
 CHECKOUT = "model.checkout"
@@ -252,6 +255,7 @@ def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
     chosen, typed = [], []
     for word in words:
         key, _, name = word.lstrip("+~").partition("=")
+        name = name.strip("\"'")
         root = key.replace("/", ".").partition(".")[0]
         if not KEY.fullmatch(key) or root not in (*nodes, *values, "experiment", "debug"):
             continue
@@ -270,6 +274,9 @@ def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
                 OmegaConf.update(config, key, stored[last], merge=False, force_add=True)
             elif parents and (node := OmegaConf.select(config, ".".join(parents))) is not None:
                 node.pop(last, None)
+    # The one node that is built on the way to the key.
+    if targets(OmegaConf.to_container(config.seeds)) != {"_target_": SEEDS}:
+        raise InputError(f"'seeds': expected plain values and the target {SEEDS}.")
     return requested_run(config).with_seed(int(settings["seed"]))
 
 

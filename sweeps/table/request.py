@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from rgbt.runs.naming import MACHINE_OVERRIDES
+from rgbt.runs.specify import CHECKOUT
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.table.cells import evaluation_of, is_counted, world_evaluations
@@ -105,7 +106,8 @@ class TableRequest:
     def deciding_words(self) -> list[str]:
         """The words typed for all rows that are of the runs, and not of the machine."""
         typed = self.typed_overrides()
-        return [word for word in typed if not word.lstrip("+~").startswith(MACHINE_OVERRIDES)]
+        machine = (*MACHINE_OVERRIDES, f"{CHECKOUT}=")
+        return [word for word in typed if not word.lstrip("+~").startswith(machine)]
 
     def evaluations(self, labels: Collection[str] | None = None) -> tuple[ExtraEvaluation, ...]:
         """Further evaluations of the runs of the rows `labels`; None: of all rows that are run."""

@@ -253,8 +253,11 @@ def below_zero() -> Counts:
     return replace(some(0), counts=counts)
 
 
-def more_labels() -> Counts:
-    return replace(some(0), counts=some(0).counts + 1)
+def other_label() -> Counts:
+    """`some(0)` with a pixel of another label."""
+    counts = some(0).counts.copy()
+    counts[0, 0, :2, 0] += [1, -1]
+    return replace(some(0), counts=counts)
 
 
 CODES = "\x1b[31m<script>alert(1)</script>"
@@ -272,16 +275,55 @@ TAMPERED: dict[str, tuple[str, Callable[[], Counts], str]] = {
         *("evaluations/test_rgb.npz", lambda: some(1, names=tuple("abcdefghijkl"))),
         "other images than counts_test",
     ),
-    "other_labels": ("evaluations/test_rgb.npz", more_labels, "other labels than counts_test"),
+    "other_labels": ("evaluations/test_rgb.npz", other_label, "other labels than counts_test"),
     "other_regions": ("counts_test.npz", lambda: some(0, partition="vertical5"), "of vertical5"),
     "fewer_regions": ("counts_test.npz", lambda: some(0, partition="ring9"), "expected 9 rows"),
     "codes": ("counts_test.npz", lambda: some(0, partition=f"ring5{CODES}"), "letters, digits"),
-    "codes_of_split": ("counts_test.npz", lambda: some(0, split=CODES), "letters, digits"),
+    "codes_of_split": ("counts_test.npz", lambda: some(0, split=CODES), "without control"),
     "codes_of_class": (
         *("counts_test.npz", lambda: some(0, classes=(CODES, "b", "c", "d"))),
         "without control",
     ),
 }
+
+
+def skipped() -> Counts:
+    return some(1).select(some(1).names[1:])
+
+
+def at_another_size() -> Counts:
+    return replace(some(1), counts=some(1).counts * 4)
+
+
+# What evaluations of the same run may write beside its counts.
+FITTING: dict[str, tuple[str, Callable[[], Counts]]] = {
+    "unreadable image": ("evaluations/test_rgb.npz", skipped),
+    "counted at another size": ("evaluations/test_rgb.npz", at_another_size),
+    "files that changed later": ("counts_val.npz", lambda: some(1, split="val", dataset="before")),
+    "name of a split": ("evaluations/night rain.npz", lambda: some(1, split="night rain")),
+    "other regions": ("evaluations/test_rgb_ring9.npz", lambda: some(1, partition="own")),
+}
+
+
+@pytest.mark.parametrize("kind", FITTING)
+def test_what_evaluations_write_is_read(run: RunResult, kind: str) -> None:
+    file, counts = FITTING[kind]
+    counts().save(run.folder / file)
+    assert run.counts(file).counts.sum() == counts().counts.sum()
+    run.check()
+
+
+def test_names_of_images_may_have_any_space(tmp_path: Path) -> None:
+    names = tuple(f"shot {n}\u202fPM\u3000\u200d" for n in range(12))
+    some(0, names=names).save(tmp_path / "a.npz")
+    assert Counts.load(tmp_path / "a.npz").names == names
+
+
+def test_rows_that_pairs_cannot_have_are_refused(run: RunResult) -> None:
+    odd = replace(some(0), counts=some(0).counts[:, :4], partition="aligned3")
+    odd.save(run.folder / "evaluations/consistency_x_test.npz")
+    with pytest.raises(InputError, match="other rows than aligned3"):
+        run.check()
 
 
 @pytest.mark.parametrize("kind", [*TAMPERED, "no_key", "score", "no_score", "settings"])
