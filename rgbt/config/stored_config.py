@@ -30,7 +30,7 @@ EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
 # The key of a setting or group; what in any value acts; what in that of a group is a place.
 KEY = re.compile(r"[a-z_]\w*([./][\w-]+)*", re.IGNORECASE | re.ASCII)
 ACTS = re.compile(r"\$\{(?!px:\d+\})|_target_|\]\(|://")
-PLACE = re.compile(r"^[\"']?[/~]|(^|/)\.\.(/|$)|://")
+PLACE = re.compile(r"^[\"']?[/~]|(^|/)\.\.(/|$)")
 
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
 
@@ -115,7 +115,7 @@ def check_words(words: Iterable[str], source: str) -> None:
         key, equals, value = word.lstrip("+~").partition("=")
         is_plain = KEY.fullmatch(key) and (equals or word.startswith("~"))
         is_hydra = key.split(".")[0].split("/")[0] == "hydra"
-        is_place = key.partition("/")[0] in (*groups(), "experiment") and PLACE.search(value)
+        is_place = key.partition("/")[0] in groups() and PLACE.search(value)
         acts = is_hydra or key == "trust" or key.endswith(".checkout") or ACTS.search(word)
         if not is_plain or is_place or acts or not word.isprintable():
             raise InputError(f"{source}: the word {_shown(word)} is not one of a setting.")

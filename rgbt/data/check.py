@@ -30,7 +30,7 @@ from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
 
-# Names of samples, "" where there is none, and what is said of each.
+# Name of a sample, or "" for the whole data set, and a sentence about it.
 Sentences = list[tuple[str, str]]
 
 # In sentences of one kind: values, which are kept, and paths and other numbers, which are not.

@@ -170,6 +170,22 @@ def label_pixels(label: Array, num_classes: int) -> PixelCounts:
     return np.append(counts[:num_classes], counts[IGNORE])
 
 
+def pixels_of(
+    dataset: LabelledDataset, name: str, on_error: Literal["raise", "skip"]
+) -> PixelCounts:
+    """`label_pixels` of an image of a data set; 0 without a label.
+
+    A label that cannot be read is an InputError, or counts as none with on_error="skip".
+    """
+    try:
+        label = dataset.label(name)
+    except InputError:
+        if on_error == "raise":
+            raise
+        label = None
+    return label_pixels(np.empty(0, np.uint8) if label is None else label, dataset.num_classes)
+
+
 def classes_in(
     dataset: LabelledDataset, names: Sequence[str], on_error: Literal["raise", "skip"]
 ) -> tuple[PixelCounts, bool]:
@@ -186,13 +202,7 @@ def classes_in(
         is_several = shown.sum() > min(1, dataset.num_classes - 1)
         if is_several and (shown[scored].all() or number >= len(spread)):
             return pixels, False
-        try:
-            label = dataset.label(name)
-        except InputError:
-            if on_error == "raise":
-                raise
-            label = None
-        pixels += 0 if label is None else label_pixels(label, dataset.num_classes)
+        pixels += pixels_of(dataset, name, on_error)
     return pixels, True
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.labels import PixelCounts, label_pixels
+from rgbt.data.labels import PixelCounts, pixels_of
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.loaders import Examples
 from rgbt.dataset import LabelledDataset
@@ -78,20 +78,10 @@ class RareClasses:
 def class_pixels(
     dataset: LabelledDataset, split: str, *, on_error: Literal["raise", "skip"] = "raise"
 ) -> PixelCounts:
-    """Pixels of each class in each label of a split as stored, (N, K); unlabelled images: 0.
-
-    A label that cannot be read is an InputError, or counts as none with on_error="skip".
-    """
+    """Pixels of each class in each label of a split as stored, (N, K), see `pixels_of`."""
 
     def counted(name: str) -> PixelCounts:
-        try:
-            label = dataset.label(name)
-        except InputError:
-            if on_error == "raise":
-                raise
-            label = None
-        label = np.empty(0, np.uint8) if label is None else label
-        return label_pixels(label, dataset.num_classes)[:-1]
+        return pixels_of(dataset, name, on_error)[:-1]
 
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         return np.stack(list(pool.map(counted, dataset.names(split))))

@@ -166,7 +166,8 @@ class RunResult:
             return
         own = Counts.load(first)
         # Unreadable images may have been skipped, once or both times.
-        names = [name for name in counts.names if name in set(own.names)]
+        known = set(own.names)
+        names = [name for name in counts.names if name in known]
         is_part = len(names) in (len(own.names), len(counts.names))
         if not is_part or own.classes != counts.classes:
             raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")

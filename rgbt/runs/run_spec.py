@@ -275,17 +275,18 @@ class RunSpec:
     def names_files(self) -> bool:
         """Whether the key depends on files of its own, or of a run upstream: weights, labels, code.
 
-        Such a stored run is told by its settings, because a stranger's files are not opened.
+        Such a stored run is compared by its settings: a stranger's files are not opened.
         """
-        is_external = self.plain["model"].get("_target_") == EXTERNAL
-        has_weights = self.weights is not None and self.dependency(WEIGHTS) is None
-        places = (self.plain["domains"][name] for name in ("source", "target"))
-        names = {place["labels"] for place in places if place}
-        has_labels = any(
-            name not in (GIVEN, NONE) and not str(name).startswith("experiment:") for name in names
+        named = {WEIGHTS: self.weights}
+        for name in ("source", "target"):
+            domain = self.plain["domains"][name] or {}
+            named[labels_key(name)] = domain.get("labels")
+        is_named = any(
+            value not in (None, GIVEN, NONE) and self.dependency(key) is None
+            for key, value in named.items()
         )
-        of_upstream = any(each.run.names_files for each in self.dependencies)
-        return is_external or has_weights or has_labels or of_upstream
+        is_external = self.plain["model"].get("_target_") == EXTERNAL
+        return is_external or is_named or any(run.names_files for run in self.upstream)
 
     @property
     def drawn(self) -> SourceSeeds:
