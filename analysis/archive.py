@@ -42,8 +42,9 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import sealed, write_json
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import MEASUREMENT, Counts
 from rgbt.metrics.details import details_of
+from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.pairs import protocol_of
 from rgbt.runs.folder import RunFolder, find_run, is_finished, read_result, runs_in
 from rgbt.runs.result import RunResult
@@ -54,10 +55,6 @@ if TYPE_CHECKING:
     from rgbt.runs.run_spec import RunSpec
 
 SHARED = "shared"
-# Files of a run folder that are archived: its counts, and what is kept as it is.
-COUNTS = ("counts_test.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
-ROBUSTNESS = "evaluations/robustness/*/*.json"
-
 # Member with all texts of a run, which repeat most of those of another run in ``shared/``.
 PACKED_TEXTS = "texts.json.z"
 
@@ -125,11 +122,6 @@ def _write_members(path: Path, folder: Path) -> None:
             write_atomic(file, content)
 
 
-def counts_of(folder: Path) -> list[Path]:
-    """The files of counts of a run folder."""
-    return sorted(each for pattern in COUNTS for each in folder.glob(pattern))
-
-
 def add(run: RunResult, folder: Path) -> Path:
     """Put a finished run into the archive `folder`; the same results are written once.
 
@@ -195,11 +187,9 @@ def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
     # Its parameters, for MLflow, are the configuration again.
     texts["run.json"] = json.dumps(sealed(vars(replace(run.description, params={}))))
     members = {PACKED_TEXTS: _packed_texts(json.dumps(texts).encode(), shared)}
-    for path in sorted(run.folder.glob(ROBUSTNESS)):
-        members[path.relative_to(run.folder).as_posix()] = path.read_bytes()
-    for path in counts_of(run.folder):
-        if (found := Counts.load(path)).split != "val":  # no table reads those
-            members[f"{path.relative_to(run.folder).as_posix()}.xz"] = _packed_counts(found, shared)
+    for name, measurement in run.measurements().items():
+        if measurement.split != "val":  # no table reads those
+            members[f"{name}.xz"] = _packed_counts(Counts.load(run.folder / name), shared)
     return members
 
 
@@ -232,10 +222,10 @@ def _unpack_texts(content: bytes, shared: Path) -> dict[str, bytes]:
 
 def _packed_counts(counts: Counts, shared: Path) -> bytes:
     """LZMA of a JSON line and of the bytes of the counts, images last and by significance."""
-    fields, array = vars(counts).copy(), counts.counts
-    arrays = {name: np.array(fields.pop(name)) for name in ("names", "classes")}
-    arrays["night"] = np.array(fields.pop("night") or (), bool)
-    arrays["unscored"] = np.array(fields.pop("unscored"), str)
+    array = counts.counts
+    arrays = {name: np.array(getattr(counts, name)) for name in ("names", "classes")}
+    arrays["night"] = np.array(counts.night or (), bool)
+    arrays["unscored"] = np.array(counts.unscored, str)
     # Details are no matrices, and the rows of triples are predictions.
     if details_of(counts.partition) is None and protocol_of(counts.partition) != "triples":
         array = array.copy()
@@ -247,7 +237,8 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
     name = _digest(file.getvalue())
     if not (path := shared / f"{name}.npz.xz").exists():
         write_atomic(path, lzma.compress(file.getvalue(), preset=9))
-    header = fields | {"counts": [array.dtype.str, *array.shape], "shared": name}
+    header = {"counts": [array.dtype.str, *array.shape], "shared": name}
+    header[MEASUREMENT] = counts.measurement.to_json()
     images_last = np.moveaxis(array, 0, -1)
     is_there = images_last != 0  # most counts are 0: a bit each makes the file a sixth smaller
     planes = images_last[is_there].view(np.uint8).reshape(-1, array.itemsize).T
@@ -276,11 +267,13 @@ def _unpack_counts(content: bytes, shared: Path) -> Counts:
     flat = planes.reshape(images_last.itemsize, -1).T
     images_last[is_there] = np.ascontiguousarray(flat).view(kind).ravel()
     array = np.ascontiguousarray(np.moveaxis(images_last, -1, 0))
+    measurement = Measurement.from_json(fields[MEASUREMENT])
     if "labelled" in arrays:
-        rows, right = _by_label(array, fields["partition"])
+        rows, right = _by_label(array, measurement.partition)
         right[...] = arrays["labelled"] - rows.sum(-1)
-    fields |= {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
-    return Counts(**fields, counts=array, night=tuple(arrays["night"].tolist()) or None)
+    texts = {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
+    night = tuple(arrays["night"].tolist()) or None
+    return Counts(counts=array, night=night, measurement=measurement, **texts)
 
 
 def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:
@@ -358,9 +351,9 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
             folder = unpack(path, Path(scratch)).folder
             RunFolder(folder).write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
             write_json(folder / "result.json", {**(read_result(folder) or {}), "key": spec.key})
-            for file in counts_of(folder):
-                counts = Counts.load(file)
-                replace(counts, run=spec.key if counts.run else "").save(file)
+            for name, measurement in RunResult(folder).measurements().items():
+                counts = Counts.load(folder / name)
+                replace(counts, measurement=replace(measurement, run=spec.key)).save(folder / name)
             added = add(RunResult(folder.rename(folder.with_name(spec.key))), options.archive)
         path.unlink()
         print_rich(plain_text(f"{path}  ->  {added}"))

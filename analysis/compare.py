@@ -102,13 +102,14 @@ def main(options: Options, _: list[str]) -> int:
     lists = [" or ".join(sorted({e.run.lists for e in each if e.run})) for each in opened]
     if lists[0] != lists[1] and all(lists):
         parts.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
+    unlike = f"Measured differently ({'; '.join(found.unlike)})." if found.unlike else ""
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
         "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
-    lines = [said, *parts, found.evidence.reason, remark]
+    lines = [said, unlike, *parts, found.evidence.reason, remark]
     print_rich(plain_text("\n".join(filter(None, lines))))
-    text = f"{grid.to_markdown()}\n{said}\n"
+    text = "\n".join(filter(None, [grid.to_markdown(), said, unlike, ""]))
     write_files(options.out, {"comparison.md": text, "comparison.csv": comparison_frame(found)})
     return 0
 

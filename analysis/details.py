@@ -21,6 +21,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import ScoreGrid, score_grid
 from rgbt.metrics.scores import absent_rule
 from rgbt.tables import TextTable, number
@@ -79,13 +80,15 @@ def main(options: Options, _: list[str]) -> int:
 
 def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]:
     """The counts of a method by what they are of, one for each training."""
-    stored = [
-        [each for each in evaluations_of(named.run, split) if each.condition in VIEWS]
-        if named.run
-        else [named]
-        for named in opened
-    ]
-    every = [{(e.condition, e.counts.partition): e.counts for e in found} for found in stored]
+    every: list[dict[Key, Counts]] = []
+    for named in opened:
+        found: dict[Key, Counts] = {}
+        for each in evaluations_of(named.run, split) if named.run else [named]:
+            of = each.counts.measurement
+            is_alike = set(of.changed) <= {"view", "partition"} and not protocol_of(of.partition)
+            if named.run is None or is_alike:
+                found[of.view if named.run else "", of.partition] = each.counts
+        every.append(found)
 
     def order(key: Key) -> tuple[str, int, int]:
         details = details_of(key[1])
@@ -93,9 +96,10 @@ def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]
         return regions_of(key[1]), kind, ("", *VIEWS).index(key[0])
 
     keys = sorted({key for found in every for key in found}, key=order)
+    is_more = len({view for view, _ in keys}) > 1 or any(details_of(key[1]) for key in keys)
     for named, found in zip(opened, every, strict=True):
         missing = [details_of(key[1]) for key in keys if key not in found]
-        if missing or not keys:
+        if missing or not (is_more or named.run is None):
             views = "modality=all" if len({view for view, _ in keys}) != 1 else "..."
             kinds = ",".join(dict.fromkeys(each.kind for each in missing if each)) or "boundary"
             folder = named.path.parent

@@ -1,49 +1,40 @@
-"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name.
-
-Also the counts of corrupted images, which ``rgbt robustness`` writes beside a run or to ``out=``.
-"""
+"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from analysis.archive import archived, counts_of, unpack
-from rgbt.checks import InputError, nearest, one_line, split_list
-from rgbt.files.plain_files import read_json
+from analysis.archive import archived, unpack
+from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.corruption_node import row_name
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.details import details_of
+from rgbt.metrics.measurement import CLEAN
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
 from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
-from rgbt.runs.naming import row_name
-from rgbt.runs.result import RunResult
+from rgbt.runs.result import COUNTS, RunResult
 from rgbt.terminal import info, warn
-from rgbt.types import VIEWS
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
-# Tags of runs; folder of their evaluations, and the one below it of corrupted images.
-EVALUATIONS, ROBUSTNESS = "evaluations", "robustness"
-
-# Condition of images as they are, as the run is made for; subset of all images of a split.
-CLEAN, ALL = "clean", "all"
+SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"  # tags of runs
+ALL = "all"  # subset of all images of a split
 
 SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
 OF_FILES = ("run", "experiment", "group", "seed", "split", "condition", "severity", "partition")
@@ -62,23 +53,23 @@ class Evaluation:
     """A file of counts, of a run or of another method.
 
     Attributes:
-        run: that was evaluated; None: the file says nothing about one.
-        condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
-            was changed: another head, checkpoint, data set, views or statistics of batches.
-        severity: of the corruption, 0 is the clean image; NaN for others.
-        row: the corruption alone: "noise", "rgb_removed", "features-thermal"; "" for others.
-        title: of the corruption, as shown.
-        unit: of the severity; "" where there is one alone.
+        run: that was evaluated; None: the file is in no run folder.
     """
 
     path: Path
     counts: Counts
     run: RunResult | None = None
-    condition: str = ""
-    severity: float = math.nan
-    row: str = ""
-    title: str = ""
-    unit: str = ""
+
+    @property
+    def condition(self) -> str:
+        """`rgbt.metrics.measurement.Measurement.condition`."""
+        return self.counts.measurement.condition
+
+    @property
+    def severity(self) -> float:
+        """That of the corruption; NaN without one."""
+        of = self.counts.measurement
+        return of.severity if of.corruption else math.nan
 
     @property
     def said(self) -> str:
@@ -96,28 +87,18 @@ class Evaluation:
         """Name of the method in tables: the group of the run, or the name of file or folder."""
         if self.run is not None:
             return self.run.tags.get(GROUP) or self.run.key
-        folder = self.path.parent
-        folder = folder.parent if folder.name == EVALUATIONS else folder
-        is_generic = self.path.stem.startswith(("counts_", "consistency_"))
-        return folder.name if is_generic else self.path.stem
+        of = self.counts.measurement
+        if self.path.name == of.file_name and of.run:
+            return " · ".join(filter(None, (of.run, of.label)))
+        # Folders of rgbt score and of rgbt robustness have files of equal names.
+        is_generic = self.path.name == of.file_name or self.path.stem.startswith("counts_")
+        return self.path.parent.name if is_generic else self.path.stem
 
     @property
     def seed(self) -> int | None:
         """The seed of the run; None for a file."""
         text = "" if self.run is None else self.run.tags.get(SEED, "")
         return int(text) if text.isdecimal() else None
-
-
-def level_of(path: Path) -> Evaluation:
-    """A file of ``rgbt robustness``, with the description beside it; InputError if damaged."""
-    file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
-    made = read_json(file, dict[str, Any], advice)
-    try:
-        row, title, unit = (str(made[key]) for key in ("row", "title", "unit"))
-        severity = float(made["severity"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{file} is not of rgbt robustness ({one_line(error)}).") from error
-    return Evaluation(path, Counts.load(path), None, row, severity, row, title, unit)
 
 
 def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
@@ -138,9 +119,9 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
             run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read
             first = found.setdefault(run.key, run)
-            shared = {each.relative_to(run.folder) for each in counts_of(run.folder)}
-            shared &= {each.relative_to(first.folder) for each in counts_of(first.folder)}
-            for name in shared if first is not run else ():
+            if first is run:
+                continue
+            for name in counts_of(run.folder) & counts_of(first.folder):
                 one, two = (Counts.load(each.folder / name) for each in (first, run))
                 differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
         except InputError as error:
@@ -150,42 +131,24 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     return [found[key] for key in sorted(found)]
 
 
+def counts_of(folder: Path) -> set[Path]:
+    """The files of counts of a run, inside its folder."""
+    return {path.relative_to(folder) for each in COUNTS for path in folder.glob(each)}
+
+
 def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
     """Counts of a run of one split: as it ended, then other inputs, pairs of frames, corruptions.
 
     A damaged file is left out with a warning.
     """
-    for path in counts_of(run.folder):
+    for name, measurement in run.measurements().items():
+        if measurement.split != split:
+            continue
+        path = run.folder / name
         try:
-            found = _evaluation(run, path)
+            yield Evaluation(path, run.counts(name), run)
         except InputError as error:
             warn(f"{path} is left out: {error}")
-            continue
-        # Clean images once more, with their corruptions, are those that the run ended with.
-        is_again = found.row == found.condition == CLEAN
-        if found.counts.split == split and not is_again:
-            yield found
-
-
-def _evaluation(run: RunResult, path: Path) -> Evaluation:
-    """What a file is of; its name and the description beside it say so."""
-    counts = run.counts(path.relative_to(run.folder).as_posix())
-    if path.parent == run.folder:
-        return Evaluation(path, counts, run, CLEAN)
-    other = "" if counts.dataset == run.fingerprint else f"dataset {counts.dataset[:8]}"
-    if path.parent.parent.name == ROBUSTNESS:
-        level, rest = level_of(path), path.parent.name.removeprefix(counts.split).strip("_")
-        words = [level.row, rest, other]
-        return replace(level, run=run, condition=" ".join(filter(None, words)))
-    split, partition = re.escape(counts.split), regions_of(counts.partition)
-    after = f"({'|'.join(VIEWS)})_{partition}(.*?)(-({'|'.join(KINDS)}))?"
-    if match := re.fullmatch(f"consistency_[a-z]+(.*)_{split}(.*)", path.stem):
-        words = [CLEAN, *match.groups(), other]
-    elif match := re.fullmatch(f".*_{split}_{after}", path.stem):
-        words = [match[1], match[2], other]
-    else:
-        words = [path.stem, other]
-    return Evaluation(path, counts, run, " ".join(filter(None, (w.strip("_-") for w in words))))
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
@@ -239,7 +202,7 @@ def results(
 
     Returns:
         the columns `COLUMNS`: run (its key), experiment, group (name that its seeds share), seed,
-        split, condition and severity (see `Evaluation`), partition of the image into regions, and
+        split, condition, severity (NaN: not corrupted), partition of the image into regions, and
         those of `score_frame`.
     """
     import pandas as pd
@@ -275,8 +238,8 @@ def open_counts(
         split: "": the test split of runs, and whatever a file holds.
         frames: of runs, counts of single frames, or of pairs of frames by one protocol
             (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
-        condition: of runs, counts of another input or of corrupted images (`Evaluation`):
-            "thermal", "noise 16", "removed:rgb"; "": as the runs ended.
+        condition: of runs, counts of another input or of corrupted images: "thermal", "noise 16",
+            "removed:rgb"; "": as the runs ended.
         archive: where archived runs lie, which have keys and groups as those of `runs_dir`.
 
     Raises:
@@ -355,12 +318,13 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     if not (frames or condition):
-        return Evaluation(run.folder / counts_name(split), run.counts(split), run, CLEAN)
-    known = [
-        each
-        for each in evaluations_of(run, split)
-        if (protocol_of(each.counts.partition) == frames if frames else _is_plain(each.counts))
-    ]
+        return Evaluation(run.folder / counts_name(split), run.counts(split), run)
+    known = []
+    for each in evaluations_of(run, split):
+        protocol = protocol_of(each.counts.partition)
+        is_usual = "partition" not in each.counts.measurement.changed
+        if (protocol == frames) if frames else is_usual:
+            known.append(each)
     name, *severity = (condition or CLEAN).split(" ", 1)
     wanted = " ".join((row_name(name), *severity))
     chosen = [each for each in known if wanted in (each.condition, each.said)]
@@ -388,26 +352,42 @@ class Training:
 
 
 def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
-    """The trainings that `text` names (see `open_counts`), with all levels of rgbt robustness.
+    """The trainings that `text` names (see `open_counts`), with what rgbt robustness measured.
 
     A word may also name a folder that ``rgbt robustness out=...`` wrote. InputError: not measured.
     """
     found: list[Training] = []
     for word in split_list(text, RUNS):
-        place = Path(word).expanduser()
-        if (place / f"{CLEAN}.json").is_file():
-            found.append(Training(place.name, levels_of(place)))
+        folder = Path(word).expanduser()
+        files = [] if (folder / "config.yaml").exists() else sorted(folder.glob("*.npz"))
+        if files:
+            every = [Evaluation(path, Counts.load(path)) for path in files]
+            found.append(Training(folder.name, levels_of(every, folder)))
             continue
         for named in open_counts(word, runs_dir, split):
-            place = named.path.parent / EVALUATIONS / ROBUSTNESS / named.counts.split
-            found.append(Training(named.label, levels_of(place)))
+            stored = [] if named.run is None else evaluations_of(named.run, named.counts.split)
+            found.append(Training(named.label, levels_of([*stored], named.path.parent)))
     return found
 
 
-def levels_of(folder: Path) -> tuple[Evaluation, ...]:
-    """Every level in a folder: clean first, then what has no severity, then by title."""
-    found = [level_of(path.with_suffix(".npz")) for path in sorted(folder.glob("*.json"))]
-    if CLEAN not in {level.row for level in found}:
-        raise InputError(f"{folder} has no counts of clean images; rgbt robustness makes them.")
-    order = sorted(found, key=lambda at: (at.unit != "", at.title, at.row, at.severity))
-    return tuple(sorted(order, key=lambda at: at.row != CLEAN))
+def levels_of(every: Sequence[Evaluation], folder: Path) -> tuple[Evaluation, ...]:
+    """Clean images first, then single inputs, then corruptions by title and severity.
+
+    InputError: `folder` has none of these, or not both.
+    """
+    found = []
+    for each in every:
+        changed = {key.partition(".")[0] for key in each.counts.measurement.changed}
+        if changed <= {"view", "severity", "corruption"}:
+            found.append(each)
+    is_clean = [each.condition == CLEAN for each in found]
+    if all(is_clean) or not any(is_clean):
+        what = "corrupted" if any(is_clean) else "clean"
+        raise InputError(f"{folder} has no counts of {what} images; rgbt robustness makes them.")
+
+    def order(each: Evaluation) -> tuple[bool, bool, str, str, float]:
+        of = each.counts.measurement
+        title = of.title or of.label
+        return each.condition != CLEAN, of.unit != "", title, each.condition, of.severity
+
+    return tuple(sorted(found, key=order))

@@ -19,8 +19,7 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.new_images import of_arrays, of_files
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.images import batch_of
-from rgbt.evaluation.prediction import Predictor
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.predictor import Predictor
 from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import summary
 from rgbt.runs.folder import GROUP, find_run
@@ -144,8 +143,7 @@ class Run(RunResult):
         if head is not None:
             check_choice("head", head, get_args(TestedHead))
         session = self._network
-        request = EvaluationRequest(split="", view=modality, head=head)
-        predictor = Predictor(session, session.model, request)
+        predictor = Predictor(session, modality, head)
         if isinstance(rgb, str | Path) and isinstance(thermal, str | Path):
             files = of_files(session.dataset, Path(rgb), Path(thermal))
             sample = files.read(files.names[0])

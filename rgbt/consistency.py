@@ -6,7 +6,7 @@ class.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,7 +18,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from rgbt.evaluation.prediction import EvaluationData
+    from rgbt.evaluation.pair_frames import EvaluationData
 
 PREDICTION_OPTIONS = ("pairs", "format", "palette", "prefix", "suffix")
 NETWORK_OPTIONS = ("run", "exported", "runs_dir", "checkpoint", "modality", "trust")
@@ -98,7 +98,8 @@ def main(options: Options, overrides: list[str]) -> int:
     if options.export is None:
         _measure(options, overrides)
         return 0
-    from rgbt.evaluation.pair_predictions import PairSource, write_images
+    from rgbt.evaluation.pair_frames import PairSource
+    from rgbt.evaluation.pair_predictions import write_images
     from rgbt.terminal import path_lines, print_rich
 
     source = PairSource.compose(overrides)
@@ -109,35 +110,39 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def _measure(options: Options, overrides: list[str]) -> None:
+    from rgbt.assembly.load_run import open_named
     from rgbt.evaluation import consistency_files as files
     from rgbt.evaluation import temporal_consistency as pairs_of
+    from rgbt.evaluation.measure import measurement_of, path_of
     from rgbt.evaluation.pair_frames import Pairing
     from rgbt.evaluation.pair_predictions import count_predictions
-    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
-    from rgbt.runs.folder import RunFolder, read_marker
+    from rgbt.evaluation.predictor import chosen
+    from rgbt.runs.folder import RunFolder
     from rgbt.tables import consistency_grid
     from rgbt.terminal import path_lines, print_rich, rich_table
 
     split, out = options.split, options.out
     pairing = Pairing.of(options.frames, options.flow, options.least_used)
     data: EvaluationData
+    is_own = False
     if options.predictions:
         folder, exported = options.predictions, options.pairs or options.predictions
         pairs, data = count_predictions(folder, exported, options, overrides, split, pairing)
-        paths = files.count_paths(out, data, split, pairing) if out else {}
         label = folder.resolve().name
     else:
-        network = NetworkRequest(options, overrides)
-        network.check_comparable(out)
-        request = EvaluationRequest.from_options(split, options.modality)
-        data = session = network.open()
-        label, run = session.label, session.evaluations.parent
-        suffixes = (*([request.view] if request.view else []), *network.suffixes)
-        if options.frames != "next":  # whose counts are marked by their motion
-            suffixes += other_images(session.dataset, None if out else read_marker(run))
-        paths = files.count_paths(out or session.evaluations, session, split, pairing, suffixes)
-        request = replace(request, keep=pairing.pictured(session, split))
-        pairs = pairs_of.count_pairs(session, session.model, request, pairing)
+        view, _ = chosen(options.modality)
+        data = session = open_named(options, overrides)
+        label = session.label
+        wanted = measurement_of(session, split, view)
+        is_own = wanted.is_own
+        kept = pairing.pictured(session, split)
+        pairs = pairs_of.count_pairs(session, wanted, pairing, kept)
+    paths = {}
+    for protocol, counts in pairs.counts.items():
+        if out:
+            paths[protocol] = out / counts.measurement.file_name
+        elif not options.predictions:
+            paths[protocol] = path_of(session, counts.measurement)
     table = pairs_of.consistency_table(pairs.counts, data.regions.absent)
     views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
     title = f"Consistency of {label} ({data.dataset.name}, {split}; {options.frames}: {views})"
@@ -149,8 +154,8 @@ def _measure(options: Options, overrides: list[str]) -> None:
             print_rich(sentence)
     if paths:
         print_rich(path_lines(files.write_pairs(pairs, paths, data.dataset)))
-    if pairing.frames == "virtual" and options.run and not (out or suffixes):
-        files.add_to_result(RunFolder(run), session, split, table)
+    if pairing.frames == "virtual" and is_own and not out:
+        files.add_to_result(RunFolder(session.folder), session, split, table)
 
 
 entry = PlainCommand(Options, main)

@@ -5,7 +5,7 @@ The command writes the counts and prints the tables derived from them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -61,7 +61,7 @@ class Options(NetworkOptions):
     sizes: Annotated[str, Help("edges between bins of size in pixels of an object")] = "64,256,1024"
     out: Annotated[
         Path | None,
-        Help("file for the counts, details beside it; default: evaluations/ in the run folder"),
+        Help("file for the counts, details beside it; default: in the run folder, by its content"),
     ] = None
 
 
@@ -71,43 +71,41 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and settings
     of the corruption: corruption.block=16 corruption.seed=1
     """
-    from rgbt.evaluation import request as requests
-    from rgbt.evaluation import segmentation
-    from rgbt.evaluation.prediction import check_request
+    from rgbt.assembly.load_run import open_named
+    from rgbt.config.corruption_node import split_overrides
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation import measure, tables
+    from rgbt.evaluation.corruption import corrupted, requested_corruption
+    from rgbt.evaluation.predictor import chosen
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
     from rgbt.terminal import print_rich, rich_table
     from rgbt.training.report import announce_network
 
-    if options.out is not None and (options.out.is_dir() or options.modality == ALL):
-        raise InputError(f"out={options.out} must be the file of a single evaluation's counts.")
+    split, out = options.split, options.out
+    if out is not None and (out.is_dir() or options.modality == ALL):
+        raise InputError(f"out={out} must be the file of a single evaluation's counts.")
     boundary = options.boundary_width, options.boundary_border
     details = requested(options.details, boundary, options.distances, options.sizes)
-    words, overrides = requests.split_overrides(overrides)
-    network = requests.NetworkRequest(options, overrides, options.regions)
-    corruption = requests.requested_corruption(
-        options.corruption, options.severity, words, network.trust
-    )
-    modality = "default" if options.modality == ALL else options.modality
-    request = requests.EvaluationRequest.from_options(
-        options.split, modality, options.head, corruption, details
-    )
-    batch_norm = requests.BatchNormRequest.from_options(
-        options.batch_norm, options.batch_norm_splits
-    )
-    opened = network.open()
-    check_request(opened, replace(request, batch_norm=batch_norm))
+    words, overrides = split_overrides(overrides)
+    given = options.corruption, options.severity, words, parse_trust(options.trust)
+    corruption = requested_corruption(*given)
+    view, head = chosen("default" if options.modality == ALL else options.modality, options.head)
+    opened = open_named(options, overrides, options.regions)
+    if corruption is not None:
+        opened = corrupted(opened, *corruption, split)
+    views = record_of(opened.model).views if options.modality == ALL else (view,)
+    of_norm = options.batch_norm, options.batch_norm_splits
+    wanted = [measure.measurement_of(opened, split, each, head, *of_norm) for each in views]
+    measure.check(opened, wanted[0])
     announce_network(opened)
-    views = record_of(opened.model).views if options.modality == ALL else (request.view,)
     by_view = {}
-    for each in (replace(request, view=view, batch_norm=batch_norm) for view in views):
-        result = segmentation.evaluate(opened, opened.model, each)
-        by_view[result.view] = result.counts
-        path = options.out or segmentation.counts_path(opened, network, each, result)
-        result.save(path)
-        print_rich(segmentation.overview(opened, each, result, path))
+    for each in wanted:
+        found = measure.stored_or_measured(opened, each, details, out)
+        by_view[each.view] = next(iter(found.files.values()))
+        print_rich(tables.overview(opened, found.files, found.skipped, is_new=found.is_new))
     if len(by_view) > 1:
-        print_rich(rich_table(segmentation.views_table(by_view, opened.label)))
+        print_rich(rich_table(tables.views_table(by_view, opened.label)))
     return 0
 
 

@@ -43,23 +43,24 @@ def main(options: Options, overrides: list[str]) -> int:
 
     Overrides such as dataset=mfnet dataset.root=/data/MFNet prediction.scales=[1.0]
     """
+    from rgbt.assembly.load_run import open_named
     from rgbt.evaluation.export import ExportRequest, check_out, export, other_sizes
-    from rgbt.evaluation.prediction import check_request
-    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
+    from rgbt.evaluation.predictor import Predictor, chosen
     from rgbt.terminal import path_lines, print_rich
     from rgbt.training.report import announce_network
 
     if options.exported is not None:
         raise InputError(f"exported={options.exported} is exported already; use run=...")
     check_out(options.out)
-    named = EvaluationRequest.from_options(options.split, options.modality, options.head)
-    session = NetworkRequest(options, overrides).open()
-    check_request(session, named)
+    view, head = chosen(options.modality, options.head)
+    session = open_named(options, overrides)
+    Predictor(session, view, head)  # refuses what the network does not have
+    session.dataset.names(options.split)
     announce_network(session)
     request = ExportRequest(
         out=options.out,
-        view=named.view,
-        head=named.head,
+        view=view,
+        head=head,
         image_hw=options.image_hw,
         split=options.split,
         num_images=options.images,

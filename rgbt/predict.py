@@ -60,14 +60,13 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides such as dataset=mfnet dataset.root=/data/MFNet, and settings of the corruption:
     corruption.block=16 corruption.seed=1
     """
+    from rgbt.assembly.load_run import open_named
+    from rgbt.config.corruption_node import split_overrides
+    from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation import images
-    from rgbt.evaluation.prediction import Predictor
-    from rgbt.evaluation.request import (
-        EvaluationRequest,
-        NetworkRequest,
-        requested_corruption,
-        split_overrides,
-    )
+    from rgbt.evaluation.corruption import corrupted_images, requested_corruption
+    from rgbt.evaluation.measure import measurement_of
+    from rgbt.evaluation.predictor import Predictor, chosen
     from rgbt.terminal import path_lines, print_rich, rich_table
     from rgbt.training.report import announce_network
 
@@ -77,26 +76,29 @@ def main(options: Options, overrides: list[str]) -> int:
     if is_labelling and (options.corruption != "none" or options.rgb or options.thermal):
         raise InputError("pseudo_labels=true predicts the clean images of a split, input=SPLIT.")
     label_map = images.label_map_of(options.label_map)
-    request = EvaluationRequest.from_options(options.input, options.modality, options.head)
+    view, head = chosen(options.modality, options.head)
     words, overrides = split_overrides(overrides)
-    network = NetworkRequest(options, overrides)
-    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
-    opened = network.open(label_map)
-    Predictor(opened, opened.model, request)  # refuses a view or a head that there is not
+    given = options.corruption, options.severity, words, parse_trust(options.trust)
+    corruption = requested_corruption(*given)
+    opened = open_named(options, overrides, label_map=label_map)
+    predictor = Predictor(opened, view, head)
     if not is_labelling:
-        chosen = images.chosen_images(opened, options.input, options.rgb, options.thermal)
-        chosen.check_out(out)
+        found = images.chosen_images(opened, options.input, options.rgb, options.thermal)
+        found.check_out(out)
         announce_network(opened)
         if corruption is not None:
-            chosen = corruption.images(chosen, opened, options.input)
-        print(images.write_images(opened, chosen, request, out, label_map))
+            found = corrupted_images(found, opened, *corruption, options.input)
+        print(images.write_images(opened, found, predictor, out, label_map))
         return 0
     check_choice("input", options.input, opened.dataset.splits)
     images.check_empty(out)
     announce_network(opened)
-    teacher = opened.evaluations.parent.name if options.run else opened.label
     labels = images.write_pseudo_labels(
-        opened, teacher, request, out, threshold=options.threshold, label_map=label_map
+        opened,
+        measurement_of(opened, options.input, view, head),
+        out,
+        threshold=options.threshold,
+        label_map=label_map,
     )
     print_rich(rich_table(images.labels_table(labels)))
     print_rich(path_lines([("pseudo-labels", str(labels.folder.resolve()))]))

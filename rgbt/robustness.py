@@ -31,7 +31,7 @@ class Options(NetworkOptions):
     regions: RegionsFile = "as trained"
     out: Annotated[
         Path | None,
-        Help("folder for the counts of one run; default: evaluations/robustness/ in it"),
+        Help("folder for the counts of one run; default: evaluations/ in it"),
     ] = None
 
 
@@ -39,38 +39,39 @@ def main(options: Options, overrides: list[str]) -> int:
     """Evaluate runs under every severity of every corruption; one table per run.
 
     Overrides such as dataset=mfnet dataset.root=/data/MFNet, corruption.seed=1, and any key of a
-    single corruption: corruptions=noise corruption.severities=[4,12]. Existing counts are replaced
-    only if data, weights or corruption changed. `rgbt figures figure=robustness` draws the results.
+    single corruption: corruptions=noise corruption.severities=[4,12]. What is measured already is
+    not measured again. `rgbt figures figure=robustness` draws the results.
     """
-    from rgbt.evaluation.request import NetworkRequest, choose_corruptions, split_overrides
-    from rgbt.evaluation.robustness import counts_folder, measure, robustness_grid, write_tables
+    from rgbt.assembly.load_run import open_named
+    from rgbt.config.corruption_node import choose_corruptions, split_overrides
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation.measure import path_of
+    from rgbt.evaluation.robustness import measure_all, robustness_grid, write_tables
     from rgbt.runs.folder import find_run
     from rgbt.terminal import path_lines, print_rich, rich_table
 
     words, overrides = split_overrides(overrides)
     split, out = options.split, options.out
-    networks = [
-        NetworkRequest(replace(options, run=run), overrides, options.regions)
-        for run in (split_list(options.run, "runs") if options.run else [""])
-    ]
-    corruptions = choose_corruptions(options.corruptions, words, networks[0].trust)
-    if out and len(networks) > 1:
+    corruptions = choose_corruptions(options.corruptions, words, parse_trust(options.trust))
+    runs = split_list(options.run, "runs") if options.run else [""]
+    if out and len(runs) > 1:
         raise InputError(f"out={out} is the folder of a single run, but run={options.run}.")
-    for network in networks:  # before the first of them is measured
-        network.check_comparable(out)
-        if network.options.run:
-            find_run(network.options.run, options.runs_dir)
+    for run in filter(None, runs):  # before the first of them is measured
+        find_run(run, options.runs_dir)
     # A table of some corruptions does not replace that of all.
     some = [] if options.corruptions == Options.corruptions else corruptions
-    stem = "_".join(["robustness", *(each.row for each in some)])
-    for network in networks:
-        opened = network.open()
-        folder = out or counts_folder(opened, network, split)
-        measured = measure(opened, split, corruptions, folder)
+    for run in runs:
+        opened = open_named(replace(options, run=run), overrides, options.regions)
+        every = measure_all(opened, split, corruptions, out)
         label = f"{opened.label} seed={opened.spec.seed}" if opened.step else opened.label
         on = f"{opened.dataset.name}, {split}"
-        grid = robustness_grid(measured, f"Robustness of {label} ({on}): mIoU in percent")
-        write_tables(measured, grid, folder / stem)
+        grid = robustness_grid(every, f"Robustness of {label} ({on}): mIoU in percent")
+        last = every[-1].measurement
+        folder = out or path_of(opened, last).parent
+        clean = every[0].measurement
+        first = split if clean.is_own else clean.file_name.removesuffix(".npz")
+        stem = "_".join(["robustness", first, *(each.name for each in some)])
+        write_tables(every, grid, folder / stem)
         print_rich(rich_table(grid))
         print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
     return 0

@@ -1,95 +1,111 @@
-"""Evaluations that tables request of finished runs."""
+"""Measurements that tables request of finished runs, as the words of the commands that make them."""
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import replace
+from functools import cache
+from typing import Any, Literal, TypeAlias
 
-from rgbt.metrics.details import SCENE_KINDS, DetailKind
-from rgbt.metrics.pairs import Protocol, file_name
-from rgbt.runs.naming import row_name
-from rgbt.runs.result import RunResult
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.component import build
+from rgbt.config.compose import compose
+from rgbt.config.corruption_node import choose_corruption
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import DEFAULTS, SCENE_KINDS, Details
+from rgbt.metrics.measurement import Measurement, settings_of
+from rgbt.metrics.pairs import protocol_of
+from rgbt.runs.result import OWN, RunResult
 
 # The head that predicts: that of the domain of each image, or that of one domain for all.
 Head = Literal["as trained", "own", "source", "target"]
 
-# Statistics of batch normalisation, see `rgbt.evaluation.request.BatchNormRequest`.
-BatchNorm = Literal["as trained", "recomputed", "adabn", "batch"]
+# Options of rgbt evaluate and overrides of the data set, such as ("modality=rgb",
+# "details=boundary"); of pairs of frames their protocol ("frames=aligned",). (): the test that a
+# run ends with.
+Words: TypeAlias = tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class ExtraEvaluation:
-    """An evaluation of a finished run beside the one that every run ends with.
+def command_of(words: Words) -> Words:
+    """Module that makes a measurement, and its arguments except the run.
 
-    Attributes: see `sweeps.table.table.Column`, and
-        regions: a file of ``conf/metric``, or "as trained".
-        details: kind of counts beside the confusion matrices, see `rgbt.metrics.details`.
-        world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
-        dataset: overrides of the data set that make this world.
+    One call makes both protocols of virtual views, or several details.
     """
+    options = _options(words)
+    if protocol := options.get("frames"):
+        return ("rgbt.consistency", f"frames={'next' if protocol == 'next' else 'virtual'}")
+    if kind := options.get("details"):
+        options["details"] = "all" if kind in SCENE_KINDS else "boundary,calibration"
+    return ("rgbt.evaluate", *(f"{key}={value}" for key, value in options.items()))
 
-    modality: str = "default"
-    regions: str = "as trained"
-    frames: Protocol | None = None
-    head: Head = "as trained"
-    corruption: str | None = None
-    severity: float | None = None
-    batch_norm: BatchNorm = "as trained"
-    batch_norm_splits: tuple[str, ...] = ()
-    details: DetailKind | None = None
-    world: str = ""
-    dataset: tuple[str, ...] = ()
 
-    def is_stored(self, result: RunResult) -> bool:
-        """Whether a finished run has its counts."""
-        return result.has_counts(self.path, other_dataset=bool(self.dataset))
+def stored_at(result: RunResult, words: Words) -> str | None:
+    """The file, inside the folder of a finished run, with the counts of a measurement."""
+    if not words:
+        return OWN
+    known = result.measurements()
+    if not known:
+        return None
+    # Pairs of frames may be all that there is of weights or predictions.
+    wanted = measurement_of(words, known.get(OWN, next(iter(known.values()))))
+    return next((path for path, found in known.items() if _is_same(found, wanted)), None)
 
-    @property
-    def label(self) -> str:
-        """The name of its counts: "table_rgb_ring5_occluded-0.5"."""
-        return self.path.rpartition("/")[2].removesuffix(".npz")
 
-    @property
-    def command(self) -> tuple[str, ...]:
-        """Module that makes it, and its arguments except the run.
+def counts_of(result: RunResult, words: Words) -> Counts:
+    """The counts of a measurement of a finished run; InputError: there are none, or damaged."""
+    path = stored_at(result, words)
+    if path is None:
+        raise InputError(f"{result.folder} has no counts of {' '.join(words)}.")
+    return result.counts(path)
 
-        One call makes both protocols of virtual views, or several details.
-        """
-        if self.frames is not None:
-            return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
-        details = "all" if self.details in SCENE_KINDS else "boundary,calibration"
-        given = {
-            "head": None if self.head == "as trained" else self.head,
-            "corruption": self.corruption,
-            "severity": None if self.severity is None else f"{self.severity:g}",
-            "batch_norm": None if self.batch_norm == "as trained" else self.batch_norm,
-            "batch_norm_splits": ",".join(self.batch_norm_splits) or None,
-            "details": None if self.details is None else details,
-        }
-        words = (f"{key}={value}" for key, value in given.items() if value is not None)
-        fixed = (f"modality={self.modality}", f"regions={self.regions}")
-        return ("rgbt.evaluate", *fixed, *words, *self.dataset)
 
-    @property
-    def path(self) -> str:
-        """Path of its counts inside the run folder: details are beside the matrices."""
-        out = self.out
-        return out if self.details is None else f"{out.removesuffix('.npz')}-{self.details}.npz"
+def _is_same(found: Measurement, wanted: Measurement) -> bool:
+    if wanted.dataset_words:  # they say which images these are
+        is_same = wanted.dataset_words == found.dataset_words
+        return is_same and set(wanted.differences(found)) == {"dataset"}
+    protocol = protocol_of(wanted.partition)
+    if protocol is None or protocol != protocol_of(found.partition):
+        return found == wanted
+    # The next frames are those of the data set, whose motion marks the partition.
+    is_usual = protocol == "next" or "-" not in found.partition
+    return is_usual and set(wanted.differences(found)) <= {"partition"}
 
-    @property
-    def out(self) -> str:
-        """Path, inside the run folder, of the file that the command writes."""
-        if self.frames is not None:
-            return file_name(self.frames, "test")
-        head = "" if self.head == "as trained" else f"{self.head}-head"
-        # The overrides tell worlds apart, because those of a name may change.
-        digest = hashlib.sha256("\n".join(self.dataset).encode()).hexdigest()[:8]
-        world = f"world-{digest}" if self.dataset else ""
-        severity = "" if self.severity is None else f"-{self.severity:g}"
-        corruption = f"{row_name(self.corruption)}{severity}" if self.corruption else ""
-        norm = "-".join(("norm", self.batch_norm, *self.batch_norm_splits))
-        norm = "" if self.batch_norm == "as trained" else norm
-        regions = self.regions.replace(" ", "-")
-        words = ("table", self.modality, regions, head, corruption, norm, world)
-        return f"evaluations/{'_'.join(filter(None, words))}.npz"
+
+def measurement_of(words: Words, base: Measurement) -> Measurement:
+    """What `words` request of a run; `base`: the test that it ended with."""
+    options = _options(words)
+    found: dict[str, Any] = {"partition": base.partition}
+    if (view := options.get("modality", "default")) != "default":
+        found["view"] = view
+    if head := options.get("head"):
+        found["head"] = head
+    if statistics := options.get("batch_norm"):
+        splits = options.get("batch_norm_splits", "")
+        found |= {"statistics": statistics, "statistics_of": tuple(filter(None, splits.split(",")))}
+    if name := options.get("corruption"):
+        chosen = choose_corruption(name)
+        severity = float(options.get("severity", chosen.node["severities"][0]))
+        settings = {**dict(base.settings), **dict(settings_of(chosen.settings))}
+        found |= {"severity": severity, "settings": tuple(sorted(settings.items()))}
+    if regions := options.get("regions"):
+        found["partition"] = _partition_of(regions)
+    if kind := options.get("details"):
+        details: Any = kind
+        found["partition"] = Details(details, DEFAULTS[details]).partition(found["partition"])
+    if protocol := options.get("frames"):
+        found["partition"] = f"{protocol}0"
+    if overrides := tuple(word for word in words if word.startswith("dataset")):
+        found |= {"dataset_words": overrides, "dataset": ""}
+    return replace(base, **found)
+
+
+def _options(words: Words) -> dict[str, str]:
+    return dict(word.split("=", 1) for word in words)
+
+
+@cache
+def _partition_of(regions: str) -> str:
+    words = [f"metric={regions}"]
+    with composing(words):
+        name: str = build(compose(words).metric).name
+    return name

@@ -10,7 +10,7 @@ from typing import Literal
 
 from rgbt.runs.folder import read_result
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words
 
 Value = str | int | float | bool | None
 State = Literal["finished", "failed", "running", "waiting", "missing"]
@@ -28,7 +28,7 @@ class Point:
         params: what a grid or a search chose, by key.
         tags: MLflow tags that the runs get.
         seeds: one run per seed, whose mean is the value of the point; (): the overrides say it.
-        evaluations: made of every run once it is finished.
+        evaluations: words of measurements made of every run once it is finished.
     """
 
     label: str
@@ -36,7 +36,7 @@ class Point:
     params: Mapping[str, Value] = field(default_factory=dict)
     tags: Mapping[str, str] = field(default_factory=dict)
     seeds: tuple[int, ...] = ()
-    evaluations: tuple[ExtraEvaluation, ...] = ()
+    evaluations: tuple[Words, ...] = ()
 
     def runs(self) -> tuple[tuple[str, ...], ...]:
         """Overrides of each run."""
@@ -65,7 +65,7 @@ class Outcome:
         reason: why it failed, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
-        missing: path of counts that a finished run has not -> why.
+        missing: words of a measurement that a finished run has not -> why.
     """
 
     point: Point
@@ -73,7 +73,7 @@ class Outcome:
     reason: str = ""
     results: tuple[RunResult, ...] = ()
     keys: tuple[str, ...] = ()
-    missing: Mapping[str, str] = field(default_factory=dict)
+    missing: Mapping[Words, str] = field(default_factory=dict)
 
     @property
     def is_trained(self) -> bool:

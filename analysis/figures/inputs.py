@@ -23,6 +23,7 @@ from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.terminal import warn
 
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
@@ -245,13 +246,20 @@ def open_scored(methods: str, partition: str) -> dict[str, Counts]:
     return found
 
 
-def check_same_images(every: Iterable[Counts]) -> Counts:
-    """The first counts; InputError: others on other images, or by other classes or regions."""
+def check_same_images(every: Iterable[Counts], *, alike: bool = True) -> Counts:
+    """The first counts; InputError: others on other images, or by other classes or regions.
+
+    With `alike`, a warning says what differs between the measurements beside the networks.
+    """
     reference, *others = every
+    unlike: dict[str, None] = {}
     for other in others:
         if other.dataset != reference.dataset:
             raise InputError("a figure shows methods on the images of one data set.")
         in_order(reference, other, "names")
+        unlike |= dict.fromkeys(reference.measurement.unlike(other.measurement))
+    if alike and unlike:
+        warn(f"what the figure shows is measured differently ({'; '.join(unlike)}).")
     return reference
 
 

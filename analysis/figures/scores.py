@@ -22,17 +22,18 @@ from analysis.figures.inputs import (
     check_same_images,
     figure,
 )
-from analysis.results import CLEAN, Training, trainings
+from analysis.results import Training, trainings
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.corruption_node import row_name
 from rgbt.config.options import Help
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, convention, scored_classes
+from rgbt.metrics.measurement import CLEAN
 from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
 from rgbt.metrics.scores import class_mean, miou
-from rgbt.runs.naming import row_name
 from rgbt.tables import class_labels
 from rgbt.tracking.pictures import colour_limits
 
@@ -151,12 +152,13 @@ def corrupted(
         for number, training in enumerate(each)
         for level in training.levels
     ]
-    check_same_images(level.counts for *_, level in levels)
+    check_same_images((level.counts for *_, level in levels), alike=False)
     convened = absent or convention(level.counts for *_, level in levels)
     cells = []
     for method, number, level in levels:
         score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
-        about = level.row, level.title, level.unit, level.severity
+        of = level.counts.measurement
+        about = of.condition, of.title or of.label or CLEAN, of.unit, of.severity
         cells.append((*about, method, number, float(score)))
     names_ = ["row", "title", "unit", "severity", "method", "training", "mIoU"]
     every = pd.DataFrame(cells, columns=names_)

@@ -19,6 +19,7 @@ from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, Predic
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.metric import Absent, Partition, Regions
 
 Resize = Literal["refuse", "nearest", "stretch"]
@@ -176,16 +177,18 @@ def score_folder(
         advance()
     name = options.name or folder.resolve().name
     shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
-    shared |= {"split": split, "dataset": dataset.fingerprint()}
+    of: dict[str, Any] = {"split": split, "dataset": dataset.fingerprint()}
     summed = None
     if maps.sums is not None and maps.is_one_size:
         about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
-        summed = PixelMaps(intersection=maps.sums[0], union=maps.sums[1], **about, **shared)
-    shared |= {"names": names, "night": dataset.nights(names), "absent": options.absent}
-    made = [
-        Counts(counts=by_image, partition=counter.regions.name, **shared)
-        for by_image, counter in zip(counts, counters, strict=True)
-    ]
+        summed = PixelMaps(intersection=maps.sums[0], union=maps.sums[1], **about, **of, **shared)
+    # Whatever a method gets to see, the images are those of both cameras.
+    of |= {"absent": options.absent, "view": "rgbt", "dataset_name": dataset.name}
+    shared |= {"names": names, "night": dataset.nights(names)}
+    made = []
+    for by_image, counter in zip(counts, counters, strict=True):
+        measurement = Measurement(partition=counter.regions.name, **of)
+        made.append(Counts(counts=by_image, measurement=measurement, **shared))
     return FolderScores(name, tuple(made), summed, extra, resized)
 
 

@@ -142,12 +142,15 @@ class Comparison:
         differences: in the order of the requested metrics.
         images: number of images of the first metric.
         partition: of the regions, e.g. "ring5".
+        unlike: what differs between their measurements beside the networks
+            (`rgbt.metrics.measurement.Measurement.unlike`).
     """
 
     differences: tuple[Difference, ...]
     images: int
     partition: str
     level: float
+    unlike: tuple[str, ...] = ()
 
     @property
     def evidence(self) -> Evidence:
@@ -189,10 +192,17 @@ def compare(
         images=len(images_of(parse(metrics[0]), a[0]).names),
         partition=a[0].partition,
         level=settings.level,
+        unlike=a[0].measurement.unlike(b[0].measurement),
     )
 
 
 def _term(weight: float, metric: str, seeds: Sequence[Counts], side: str) -> Term:
+    for other in seeds[1:]:
+        if unlike := seeds[0].measurement.unlike(other.measurement):
+            raise InputError(
+                f"seeds of one method are measured differently ({'; '.join(unlike)}); measure them "
+                "in one way."
+            )
     keys = {seed: f"{side}{seed}" for seed in range(len(seeds))}
     return Term(weight=weight, metric=metric, counts=dict(enumerate(seeds)), keys=keys)
 

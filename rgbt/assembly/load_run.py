@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rgbt.assembly.session import Session, names_key, open_session
+from rgbt.assembly.session import Session, measured_settings, names_key, open_session
 from rgbt.checks import InputError, check_choice
+from rgbt.config.common_options import AS_TRAINED, NetworkOptions
 from rgbt.config.compose import compose
-from rgbt.config.stored_config import check_targets, checkouts, read_settings, settings_of
+from rgbt.config.stored_config import (
+    check_targets,
+    checkouts,
+    parse_trust,
+    read_settings,
+    settings_of,
+)
 from rgbt.engine.checkpoint import check_origin, load_checkpoint, restore_weights, step_of
 from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
@@ -25,6 +34,9 @@ if TYPE_CHECKING:  # few commands map classes
     from rgbt.data.label_map import LabelMap
 
 CHECKPOINTS = ("best", "last")
+
+# Settings of a data set that say where its files are.
+FOLDERS = ("dataset.root=", "dataset.cache_dir=")
 
 
 def trusted_settings(
@@ -43,6 +55,21 @@ def trusted_settings(
         trust = (*trust, str(Path(named).expanduser().resolve()))
     check_targets(settings, trust, str(folder / "config.yaml"))
     return settings
+
+
+def open_named(
+    options: NetworkOptions,
+    overrides: Sequence[str],
+    regions: str = AS_TRAINED,
+    label_map: LabelMap | None = None,
+) -> Session:
+    """The network that the options of a command name; `regions`: a file of ``conf/metric``."""
+    if options.run and options.exported is not None:
+        raise InputError("exported: it has its own weights; omit run=.")
+    source = options.exported or options.run
+    words = [*overrides, *([] if regions == AS_TRAINED else [f"metric={regions}"])]
+    trust = parse_trust(options.trust)
+    return open_network(source, options.runs_dir, words, options.checkpoint, label_map, trust)
 
 
 def open_network(
@@ -85,6 +112,7 @@ def open_network(
         if label_map is None:
             _check_classes(session, made.classes, source)
         path, name, step = source, source.stem, made.step
+        changed = _changed(session, settings, made.fingerprint)
     else:
         config = compose(["scale=paper", f"runs_dir={runs_dir}", *overrides])
         if config.model.get("weights") is None:
@@ -98,9 +126,12 @@ def open_network(
                 "would be random."
             )
         path, name, step = spec.weights_path, spec.key, 0
+        changed = _typed(session, overrides)
     # Copies of a data set in other folders may hold other images.
     folder = runs_dir / "evaluations" / f"{name}-{session.dataset.fingerprint()[:8]}"
-    return replace(session, step=step, evaluations=folder, label=path.name)
+    digest = _digest(path, session)
+    found = replace(session, step=step, folder=folder, label=path.name)
+    return replace(found, digest=digest, changed=changed)
 
 
 def open_run(
@@ -120,6 +151,10 @@ def open_run(
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     session = with_weights(spec, folder, checkpoint, trained_with, label_map)
+    if "dataset" in session.changed:
+        words = [word for word in overrides if word.lstrip("+").startswith("dataset")]
+        words = [word for word in words if not word.startswith(FOLDERS)]
+        session = replace(session, dataset_words=tuple(words))
     counts = sorted(folder.glob("counts_*.npz"))
     if counts and label_map is None:
         _check_classes(session, Counts.load(counts[0]).classes, folder)
@@ -147,9 +182,47 @@ def with_weights(
     check_origin(payload, weights, folder.name, settings_digest(trained_with))
     session = open_session(spec, label_map, load_weights=False)
     restore_weights(session.model, payload["model"], weights)
-    step = step_of(payload, weights)
-    evaluations = folder / "evaluations"
-    return replace(session, step=step, evaluations=evaluations, label=spec.name, run=folder.name)
+    marker = read_marker(folder)
+    return replace(
+        session,
+        step=step_of(payload, weights),
+        folder=folder,
+        label=spec.name,
+        run=folder.name,
+        checkpoint=checkpoint,
+        changed=_changed(session, trained_with, None if marker is None else marker["files"]),
+    )
+
+
+def _changed(
+    session: Session, trained_with: Mapping[str, Any], fingerprint: str | None
+) -> tuple[str, ...]:
+    """See `Session.changed`; `fingerprint` of the data set that the network was trained on."""
+    before, now = measured_settings(trained_with), measured_settings(session.spec.plain)
+    changed = [key for key in sorted(now) if key not in before or before[key] != now[key]]
+    nodes = (dict(plain["metric"]) for plain in (trained_with, session.spec.plain))
+    first, second = ({key: node[key] for key in node.keys() - {"absent"}} for node in nodes)
+    changed += ["partition"] if first != second else []
+    changed += ["dataset"] if fingerprint not in (None, session.dataset.fingerprint()) else []
+    return tuple(changed)
+
+
+def _typed(session: Session, overrides: Sequence[str]) -> tuple[str, ...]:
+    """The settings of a network that is no run which were typed; see `Session.changed`."""
+    words = [word.lstrip("+").partition("=")[0] for word in overrides]
+    known = sorted(measured_settings(session.spec.plain))
+    changed = [key for key in known if any(f"{key}.".startswith(f"{word}.") for word in words)]
+    is_cut = any(word.split(".")[0] == "metric" for word in words)
+    return (*changed, *(["partition"] if is_cut else []))
+
+
+def _digest(path: Path, session: Session) -> str:
+    """SHA-256 in hexadecimal of a file of weights and of the settings of the network."""
+    model = {key: value for key, value in session.spec.model.plain.items() if key != "weights"}
+    digest = hashlib.sha256(json.dumps(model, sort_keys=True).encode())
+    with path.open("rb") as file:
+        digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def _check_classes(session: Session, trained: tuple[str, ...], source: Path) -> None:

@@ -17,7 +17,7 @@ from torch import nn
 
 from rgbt.assembly.contracts import check_dataset, watch_model
 from rgbt.checks import InputError
-from rgbt.config.compose import compose
+from rgbt.config.compose import compose, flatten
 from rgbt.config.stored_config import read_settings
 from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
@@ -49,9 +49,14 @@ class Session:
         model: the network, on the device, not wrapped.
         weights: what it took from a file, None where it is random.
         step: the optimiser step of trained weights; 0 where none is known.
-        evaluations: folder where evaluations of trained weights are written by default.
+        folder: of the run whose network it is; of another network, where its evaluations lie.
         label: name of the trained network in tables.
         run: key of the run whose network it is; "" for others.
+        digest: SHA-256 of the file of another network and of its settings.
+        checkpoint: "best" or "last", of a run.
+        changed: what of its measurements differs from the test that the run ends with: keys of
+            `measured_settings`, "partition", "dataset".
+        dataset_words: overrides that make the data set another one than that of the run.
     """
 
     spec: RunSpec
@@ -68,9 +73,13 @@ class Session:
     model: nn.Module
     weights: Plan | None
     step: int = 0
-    evaluations: Path = Path()
+    folder: Path = Path()
     label: str = ""
     run: str = ""
+    digest: str = ""
+    checkpoint: str = "best"
+    changed: tuple[str, ...] = ()
+    dataset_words: tuple[str, ...] = ()
 
     def autocast(self) -> AbstractContextManager[Any]:
         """Context of a forward pass at the precision of the run."""
@@ -202,6 +211,13 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
     except json.JSONDecodeError:
         value = text
     return bool(node.get(key.removeprefix("model."), value) == value)
+
+
+def measured_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a plain configuration that decide how images are predicted, by dotted key."""
+    precision = {"precision": plain["trainer"]["precision"]}
+    nodes = {"transform": plain["transform"], "prediction": plain["prediction"]}
+    return flatten({**nodes, "trainer": precision})
 
 
 def names_key(session: Session) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.class_scores import best_of, classes_of
+from rgbt.class_scores import classes_of
 from rgbt.engine.prediction import WHOLE, Prediction
 from rgbt.requirements import record_of
 from rgbt.types import Batch, View
@@ -27,27 +27,12 @@ def class_maps(model: nn.Module, batch: Batch, *how: Any, **settings: Any) -> Te
     return classes_of(label_scores(model, batch, *how, **settings)).to(torch.uint8)
 
 
-@torch.inference_mode()
-def probabilities(model: nn.Module, batch: Batch, *how: Any, **settings: Any) -> Tensor:
-    """(B, K, H', W') float32: probabilities of the classes; arguments as in `label_scores`.
+def shares(scores: Tensor, model: nn.Module) -> Tensor:
+    """(B, K, H', W') float32: probabilities of the classes, of their scores by `label_scores`.
 
     That is their softmax. Scores of networks that return masks are sums over queries (Mask2Former,
     semantic inference), whose softmax would hardly differ; each is divided by the sum over classes.
     """
-    return _shares(label_scores(model, batch, *how, **settings), model)
-
-
-@torch.inference_mode()
-def confident_class_maps(
-    model: nn.Module, batch: Batch, *how: Any, **settings: Any
-) -> tuple[Tensor, Tensor]:
-    """`class_maps`, and the probability (B, H', W') float32 of each of these classes."""
-    scores = label_scores(model, batch, *how, **settings)
-    # The class with the highest score has the highest probability.
-    return classes_of(scores).to(torch.uint8), best_of(_shares(scores, model)).score
-
-
-def _shares(scores: Tensor, model: nn.Module) -> Tensor:
     if record_of(model).outputs == "masks":
         return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
     return scores.softmax(1)

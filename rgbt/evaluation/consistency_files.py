@@ -10,56 +10,40 @@ from textwrap import shorten
 import numpy as np
 
 from rgbt.assembly.session import Session
-from rgbt.checks import InputError
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.pair_frames import FlowRecord, Pairing
-from rgbt.evaluation.prediction import EvaluationData
-from rgbt.evaluation.segmentation import legend_of
+from rgbt.evaluation.measure import check_replaceable, legend_of
+from rgbt.evaluation.pair_frames import FlowRecord
 from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
 from rgbt.files.atomic import write_atomic
-from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import Protocol, file_name, partition_name
+from rgbt.metrics.pairs import Protocol
 from rgbt.runs.folder import RunFolder, read_result, read_tables
 from rgbt.tables import ConsistencyTable, csv_text, without_nan
 from rgbt.tracking.pair_pictures import draw_pairs
 
 
-def count_paths(
-    folder: Path, data: EvaluationData, split: str, pairing: Pairing, suffixes: Sequence[str] = ()
-) -> dict[Protocol, Path]:
-    """Files of counts; InputError where those on another motion would be replaced."""
-    paths: dict[Protocol, Path] = {}
-    for protocol in pairing.protocols:
-        # Counts along an exact flow have one name, whatever the motion.
-        mark = "" if protocol == "next" else pairing.mark(data, protocol)
-        usual = Path(file_name(protocol, split, mark))
-        paths[protocol] = folder / usual.with_stem("_".join([usual.stem, *suffixes])).name
-    path = paths.get("next")
-    if path and path.is_file():
-        partition = partition_name("next", 1, pairing.mark(data, "next"))
-        if Counts.load(path).partition != partition:
-            raise InputError(f"{path} is of another motion; remove it, or set another out=...")
-    return paths
-
-
 def write_pairs(
     pairs: Pairs, paths: Mapping[Protocol, Path], dataset: LabelledDataset
 ) -> list[tuple[str, str]]:
-    """Write counts at `paths`, flow records and picture beside them; (what, path) of each."""
-    # Named like the counts that it shows, those of the first protocol.
-    first = paths[next(iter(pairs.counts))]
-    first.parent.mkdir(parents=True, exist_ok=True)
+    """Write counts at `paths`, flow records and picture beside them; (what, path) of each.
+
+    InputError: a file holds another measurement, which is not replaced.
+    """
     for protocol, counts in pairs.counts.items():
+        check_replaceable(paths[protocol], counts.measurement)
+    for protocol, counts in pairs.counts.items():
+        paths[protocol].parent.mkdir(parents=True, exist_ok=True)
         counts.save(paths[protocol])
     lines = [(f"counts, {protocol}", str(paths[protocol])) for protocol in pairs.counts]
+    # Named like the counts that it shows, those of the first protocol.
+    first = paths[next(iter(pairs.counts))]
     if pairs.records:
-        path = first.with_name(f"{paths['flow'].stem.removeprefix('consistency_')}.csv")
+        path = first.with_name(f"{paths['flow'].stem}.csv")
         # Unknown values are empty.
         rows = [["" if value != value else value for value in each] for each in pairs.records]
         write_atomic(path, csv_text([FlowRecord._fields, *rows]).encode())
         lines.append(("flow of each pair", str(path)))
     if pairs.kept:  # some of its images could be read
-        picture = first.with_name(first.stem.replace("consistency_", "pairs_") + ".png")
+        picture = first.with_name(f"pairs_{first.stem}.png")
         draw_pairs(pairs.kept, legend_of(dataset), picture)
         lines.append(("picture", str(picture)))
     return lines

@@ -18,7 +18,7 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import collate
 from rgbt.data.new_images import ToPredict, of_split
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import heads_of, view_of
+from rgbt.evaluation.predictor import heads_of, view_of
 from rgbt.exported.onnx_network import (
     Description,
     ExportedNetwork,
@@ -100,7 +100,7 @@ def export(
     graph = ScoresOfImages(session.model.cpu().float().eval(), view=view, head=head)
     description = Description(
         network=type(session.model).__name__,
-        run=session.evaluations.parent.name if session.step else session.label,
+        run=session.run or session.label,
         step=session.step,
         dataset=session.dataset.name,
         fingerprint=session.dataset.fingerprint(),

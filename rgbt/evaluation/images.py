@@ -12,7 +12,9 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_range
@@ -32,11 +34,11 @@ from rgbt.data.pseudo_labels import (
     label_path,
 )
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import Predictor, view_of, weights_digest
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import legend_of
+from rgbt.evaluation.measure import check, legend_of
+from rgbt.evaluation.predictor import Predictor
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
+from rgbt.metrics.measurement import Measurement
 from rgbt.tables import TextTable, percent
 from rgbt.terminal import info
 from rgbt.tracking.pictures import overlay
@@ -58,14 +60,13 @@ def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPr
 def write_images(
     session: Session,
     images: ToPredict,
-    request: EvaluationRequest,
+    predictor: Predictor,
     out: Path,
     label_map: LabelMap | None,
 ) -> str:
     """Write NAME_overlay.png and NAME.png of every image to `out`; how many, and where."""
     images.check_out(out)
     legend = legend_of(session.dataset)
-    predictor = Predictor(session, session.model, request)
     written = 0
     with progress() as display:
         task = display.add_task("predicting", total=len(images.names), note="images")
@@ -112,8 +113,7 @@ def check_empty(out: Path) -> None:
 
 def write_pseudo_labels(
     session: Session,
-    teacher: str,
-    request: EvaluationRequest,
+    wanted: Measurement,
     out: Path,
     *,
     threshold: float = 0.0,
@@ -122,15 +122,14 @@ def write_pseudo_labels(
     """Predict a split with the network of `session` and write its confident pixels as labels.
 
     The confidence of a pixel is the largest of its class probabilities
-    (`rgbt.engine.evaluate.probabilities`), with a label map that of the network's own class. The
+    (`rgbt.engine.evaluate.shares`), with a label map that of the network's own class. The
     folder (`rgbt.data.pseudo_labels`) is written under a temporary name and renamed at the end.
 
     Source: HeatNet's release (thermal teacher, night images). It keeps every pixel: threshold 0.
 
     Args:
         session: its network is the teacher.
-        teacher: key of its run, or file of its weights; for people.
-        request: split, view and head.
+        wanted: its split, view and head.
         out: folder, missing or empty.
         threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
         label_map: from the classes of the network to those of the data set, where they differ.
@@ -138,22 +137,22 @@ def write_pseudo_labels(
     check_range("threshold", threshold, 0, 1)
     settings: dict[str, Any] = {
         "format": FORMAT,
-        "teacher": teacher,
+        "teacher": session.run or session.label,
         "weights": weights_digest(session.model),
-        "view": view_of(session, request.view),
-        "head": request.head or session.domains.tested_head,
+        "view": wanted.view,
+        "head": wanted.head or None,
         "label_map": None if label_map is None else json.loads(json.dumps(asdict(label_map))),
         "threshold": float(threshold),
         "dataset": session.dataset.name,
         "fingerprint": session.dataset.fingerprint(),
-        "split": request.split,
+        "split": wanted.split,
         "classes": list(session.dataset.classes),
     }
     check_empty(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
         made = Path(temporary) / out.name
-        manifest = settings | _predict(session, request, made, threshold, label_map)
+        manifest = settings | _predict(session, wanted, made, threshold, label_map)
         write_json(made / MANIFEST, manifest)
         with suppress(OSError):  # another process was faster
             made.rename(out)
@@ -162,15 +161,15 @@ def write_pseudo_labels(
 
 def _predict(
     session: Session,
-    request: EvaluationRequest,
+    wanted: Measurement,
     out: Path,
     threshold: float,
     label_map: LabelMap | None,
 ) -> dict[str, Any]:
     """Predict and write all images of the split; the part of the manifest that counts them."""
-    names = session.dataset.names(request.split)
-    batches = eval_batches(session.dataset, request.split, session.transform, session.loading)
-    predictor = Predictor(session, session.model, request)
+    names = session.dataset.names(wanted.split)
+    batches = eval_batches(session.dataset, wanted.split, session.transform, session.loading)
+    predictor = check(session, wanted)
     digest = hashlib.sha256()
     counts, sums = np.zeros(IGNORE + 1, np.int64), np.zeros(IGNORE + 1)
     with progress() as display:
@@ -193,7 +192,7 @@ def _predict(
             display.advance(task, len(batch.name))
     total = int(counts.sum())
     if not total:
-        raise InputError(f"split '{request.split}': no image could be read.")
+        raise InputError(f"split '{wanted.split}': no image could be read.")
     means = [
         float(added) / FULL / int(n) if n else None for n, added in zip(counts, sums, strict=True)
     ]
@@ -208,6 +207,15 @@ def _predict(
         },
         "digest": digest.hexdigest(),
     }
+
+
+def weights_digest(model: nn.Module) -> str:
+    """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
 
 
 def labels_table(labels: PseudoLabels) -> TextTable:

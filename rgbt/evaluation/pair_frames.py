@@ -10,25 +10,31 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import zip_longest
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rgbt.assembly.session import Session
 from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.component import build
+from rgbt.config.compose import compose
+from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import NextFrames
 from rgbt.data.video import FramesInOrder
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.prediction import EvaluationData
-from rgbt.evaluation.segmentation import NUM_PANELS, panel_names
+from rgbt.evaluation.measure import NUM_PANELS, panel_names
 from rgbt.geometry.optical_flow import FlowSource, FrameFlow, frame_flow, gray_of
 from rgbt.geometry.warp import Warp
+from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import Frames, second_name
 from rgbt.metrics.pairs import Protocol
 from rgbt.requirements import check_requirements
+from rgbt.transforms.views import ViewSets
 from rgbt.types import IGNORE, Batch
 
 USUAL_FLOW: FlowSource = "both"
@@ -37,6 +43,36 @@ LEAST_USED = 0.1
 
 # Class maps (B, H', W') uint8, at the size of the labels, of frames and their names.
 Predict = Callable[[Batch, Sequence[str]], Tensor]
+
+
+@dataclass(frozen=True)
+class PairSource:
+    """The images of pairs, without a network."""
+
+    dataset: LabelledDataset
+    transform: Any
+    loading: LoaderSettings
+    regions: Regions
+    consistency: ViewSets
+
+    @classmethod
+    def compose(cls, overrides: Sequence[str]) -> PairSource:
+        """Compose overrides of the configuration; images have the size of their files."""
+        words = [*overrides, "transform=none"]
+        with composing(words):
+            config = compose(words)
+            return cls(
+                dataset=build(config.dataset),
+                transform=build(config.transform),
+                # One at a time, because the images may have any sizes.
+                loading=LoaderSettings(batch_size=1, eval_batch_size=1, num_workers=0),
+                regions=build(config.metric),
+                consistency=build(config.consistency),
+            )
+
+
+# Images and how they are counted: with a network, or for predictions of any method.
+EvaluationData: TypeAlias = Session | PairSource
 
 
 @dataclass(frozen=True)

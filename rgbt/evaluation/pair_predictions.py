@@ -13,62 +13,29 @@ NAME_next.png.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.common_options import PredictionFormatOptions
-from rgbt.config.component import build
-from rgbt.config.compose import compose
-from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
 from rgbt.data.video import FramesInOrder
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
-from rgbt.evaluation.pair_frames import Pairing, frame_pairs
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.pair_frames import Pairing, PairSource, frame_pairs
 from rgbt.evaluation.temporal_consistency import Pairs, count_predicted, to_bytes
 from rgbt.files.plain_files import inside
 from rgbt.metrics import pair_list
-from rgbt.metrics.metric import Regions
+from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
-from rgbt.transforms.views import ViewSets
 from rgbt.types import Batch
 
 CPU = torch.device("cpu")
-
-
-@dataclass(frozen=True)
-class PairSource:
-    """The images of pairs, without a network; see `rgbt.evaluation.prediction.EvaluationData`."""
-
-    dataset: LabelledDataset
-    transform: Any
-    loading: LoaderSettings
-    regions: Regions
-    consistency: ViewSets
-
-    @classmethod
-    def compose(cls, overrides: Sequence[str]) -> PairSource:
-        """Compose overrides of the configuration; images have the size of their files."""
-        words = [*overrides, "transform=none"]
-        with composing(words):
-            config = compose(words)
-            return cls(
-                dataset=build(config.dataset),
-                transform=build(config.transform),
-                # One at a time, because the images may have any sizes.
-                loading=LoaderSettings(batch_size=1, eval_batch_size=1, num_workers=0),
-                regions=build(config.metric),
-                consistency=build(config.consistency),
-            )
 
 
 def list_pairs(source: PairSource, split: str, frames: Frames) -> PairList:
@@ -173,5 +140,13 @@ def count_predictions(
     affixes = Affixes(options.prefix, options.suffix)
     given = FormatOptions(form=options.format, palette=options.palette, affixes=affixes)
     predict = FolderPredictions(folder, source.dataset, names, given)
-    request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
-    return count_predicted(source, predict, request, pairing, CPU), source
+    measurement = Measurement(
+        dataset=source.dataset.fingerprint(),
+        split=split,
+        view="rgbt",
+        partition=source.regions.name,
+        absent=source.regions.absent,
+        dataset_name=source.dataset.name,
+    )
+    kept = pairing.pictured(source, split)
+    return count_predicted(source, predict, measurement, pairing, CPU, kept), source

@@ -5,23 +5,31 @@ See `rgbt.evaluation.pair_frames` for the second frames.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.engine.progress import progress
-from rgbt.evaluation.pair_frames import Compared, FlowRecord, Pairing, Predict, Scenes, scenes
-from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.measure import check, counts_of, of_partition
+from rgbt.evaluation.pair_frames import (
+    Compared,
+    EvaluationData,
+    FlowRecord,
+    Pairing,
+    Predict,
+    Scenes,
+    scenes,
+)
 from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import CHANGES, SCORES_OF, pair_scores, value
 from rgbt.metrics.names import CA, TC, consistency
@@ -44,38 +52,39 @@ class Pairs:
 
 
 def count_pairs(
-    session: Session, model: nn.Module, request: EvaluationRequest, pairing: Pairing
+    session: Session, wanted: Measurement, pairing: Pairing, keep: Collection[str] = ()
 ) -> Pairs:
-    """Predict both frames of every scene of a split with `model`, left in evaluation mode.
+    """Predict both frames of every scene of a split, with the network left in evaluation mode.
 
     Source: Temporal, Fig. 4 (aligned: the first prediction is warped to the second frame) and its
-    release (released: it is not warped). `session.consistency` says which virtual views.
+    release (released: it is not warped). `session.consistency` says which virtual views; `keep` are
+    names of scenes that are returned for pictures.
 
     Raises:
         InputError: no sets of views, no second frames, or no image that can be read.
     """
-    assert request.corruption is None, "pairs are counted of clean images"
-    # Requests that cannot be measured are refused before anything is drawn or predicted.
+    # What cannot be measured is refused before anything is drawn or predicted.
     pairing.check(session)
-    predictor = Predictor(session, model, request)
+    predictor = check(session, wanted)
     return count_predicted(
-        session, lambda batch, _: predictor.classes(batch), request, pairing, session.device
+        session, lambda batch, _: predictor.classes(batch), wanted, pairing, session.device, keep
     )
 
 
 def count_predicted(
     data: EvaluationData,
     predict: Predict,
-    request: EvaluationRequest,
+    wanted: Measurement,
     pairing: Pairing,
     device: torch.device,
+    keep: Collection[str] = (),
 ) -> Pairs:
     """Count what `predict` says of both frames of every scene, in batches on `device`.
 
     Raises:
         InputError: an image or a prediction cannot be read, or no pair of a video can be used.
     """
-    split, num_classes = request.split, len(data.dataset.classes)
+    split, num_classes = wanted.split, len(data.dataset.classes)
     found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in pairing.protocols}
     kept: dict[str, PairExample] = {}
     records: list[FlowRecord] = []
@@ -87,8 +96,8 @@ def count_predicted(
             records += batch.records
             for protocol, maps in batch.compared.items():
                 _count(batch, maps, num_classes, found[protocol])
-            wanted = [name for name in batch.names if name in request.keep and name not in kept]
-            kept |= {name: _example(batch, name, drawn) for name in wanted if batch.compared}
+            new = [name for name in batch.names if name in keep and name not in kept]
+            kept |= {name: _example(batch, name, drawn) for name in new if batch.compared}
             done = len(records) if pairing.frames == "video" else len(found[pairing.protocols[0]])
             display.update(task, completed=done)
     if pairing.frames == "video" and all(each.used < pairing.least_used for each in records):
@@ -103,7 +112,7 @@ def count_predicted(
         joined = {name: np.concatenate([*by_set.values()]) for name, by_set in by_name.items()}
         sets = max(map(len, by_name.values()), default=0)
         partition = partition_name(protocol, sets, pairing.mark(data, protocol))
-        each_scene = counts_of(data, split, joined, partition)
+        each_scene = counts_of(data.dataset, of_partition(wanted, partition), joined)
         counts[protocol] = each_scene.added(data.consistency.scenes_per_count)
     return Pairs(counts, tuple(kept.values()), tuple(records))
 

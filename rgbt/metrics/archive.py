@@ -17,6 +17,7 @@ from rgbt.files.plain_files import disguise
 
 # Bytes that the arrays of a file hold at most: a megabyte of zeros can stand for a gigabyte.
 MAX_BYTES = 2**33
+MAX_TEXT = 2**20  # of one text
 FORMAT, DIGEST = "format", "digest"  # members of every file
 T = TypeVar("T")
 
@@ -53,9 +54,22 @@ class Archive:
                 raise ValueError(f"expected the mark '{self.mark}', got '{one_line(mark)}'")
             return build(arrays)
         except Exception as error:  # zipfile and NumPy raise anything on damaged bytes
-            said = disguise(path) or one_line(error)
-            reason = f"is not a readable file of {self.what} ({said})"
-            raise InputError(f"'{path}' {reason}; {self.advice}.") from error
+            raise self._damaged(path, error) from error
+
+    def read_text(self, path: Path, name: str, parse: Callable[[str], T]) -> T:
+        """What `parse` makes of the text called `name` of a file, of which nothing else is read."""
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                if stored.zip.getinfo(f"{name}.npy").file_size > MAX_TEXT:
+                    raise ValueError(f"'{name}' is longer than {MAX_TEXT} bytes")
+                return parse(str(stored[name]))
+        except Exception as error:
+            raise self._damaged(path, error) from error
+
+    def _damaged(self, path: Path, error: Exception) -> InputError:
+        said = disguise(path) or one_line(error)
+        reason = f"is not a readable file of {self.what} ({said})"
+        return InputError(f"'{path}' {reason}; {self.advice}.")
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

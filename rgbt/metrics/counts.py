@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.details import details_of, regions_of
+from rgbt.metrics.measurement import CONTROL, Measurement
 from rgbt.metrics.metric import Absent, number_of_regions
 from rgbt.metrics.names import DAY, NIGHT
 
-# What partition, data set and run are written with, and what no text of counts has.
-WORD, CONTROL = re.compile(r"[\w.+-]*"), re.compile(r"[\x00-\x1f\x7f-\x9f]")
+# What partition, data set and run are written with.
+WORD = re.compile(r"[\w.+-]*")
 
 # More than the pixels of any image, in the units of `rgbt.metrics.details`; sums do not overflow.
 MOST = 2**40
 
-ARCHIVE = Archive("rgbt counts 2", "counts", "evaluate the run to write it")
+MEASUREMENT = "measurement"  # member of a file
+ARCHIVE = Archive("rgbt counts 3", "counts", "evaluate the run to write it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,24 +37,16 @@ class Counts:
             (`rgbt.metrics.pairs`) and details (`rgbt.metrics.details`) have other rows.
         names: of the N images.
         night: whether each image was taken at night; None where the data set does not say.
-        partition: name of the regions: "ring5"; of pairs of frames protocol and number of sets:
-            "aligned3"; of details their kind and setting too: "ring5-boundary-0.02".
-        dataset: fingerprint of the data set.
         unscored: classes that are left out of every mean over classes; their pixels count.
-        absent: convention for absent classes (`rgbt.metrics.scores`) of the evaluation.
-        run: key of the run whose network predicted; "" for others.
+        measurement: what was measured, how and on what.
     """
 
     counts: NDArray[np.integer]
     names: tuple[str, ...]
     night: tuple[bool, ...] | None
     classes: tuple[str, ...]
-    partition: str
-    dataset: str
-    split: str
+    measurement: Measurement
     unscored: tuple[str, ...] = ()
-    absent: Absent = "released"
-    run: str = ""
 
     def __post_init__(self) -> None:
         shape, classes = self.counts.shape, len(self.classes)
@@ -67,9 +61,27 @@ class Counts:
             )
         if self.night is not None and len(self.night) != len(self.names):
             raise ValueError(f"night: expected {len(self.names)} values, got {len(self.night)}.")
-        if self.absent not in get_args(Absent):
-            raise ValueError(f"absent: expected released or exclude, got '{self.absent}'.")
         scored_classes(self.classes, self.unscored)
+
+    @property
+    def partition(self) -> str:
+        """`Measurement.partition`."""
+        return self.measurement.partition
+
+    @property
+    def dataset(self) -> str:
+        """`Measurement.dataset`."""
+        return self.measurement.dataset
+
+    @property
+    def split(self) -> str:
+        """`Measurement.split`."""
+        return self.measurement.split
+
+    @property
+    def absent(self) -> Absent:
+        """`Measurement.absent`."""
+        return self.measurement.absent
 
     @property
     def scored(self) -> NDArray[np.bool_]:
@@ -126,6 +138,7 @@ class Counts:
         # npz without pickles knows no None.
         values["night"] = np.array(self.night or (), dtype=bool)
         values["unscored"] = np.array(self.unscored, dtype=str)
+        values[MEASUREMENT] = np.array(self.measurement.to_json())
         ARCHIVE.save(path, values)
 
     @classmethod
@@ -135,8 +148,7 @@ class Counts:
 
     @classmethod
     def _of_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Counts:
-        texts = ("partition", "dataset", "split", "absent", "run")
-        given: dict[str, Any] = {key: str(arrays[key]) for key in texts}
+        given: dict[str, Any] = {MEASUREMENT: Measurement.from_json(str(arrays[MEASUREMENT]))}
         for key in ("names", "classes", "unscored"):
             given[key] = tuple(arrays[key].tolist())
         night = tuple(arrays["night"].astype(bool).tolist()) or None
@@ -154,13 +166,9 @@ class Counts:
         if ends[0] < 0 or ends[1] > MOST:
             raise ValueError(f"counts: expected numbers of pixels, got {ends[0]} to {ends[1]}.")
         for key in ("partition", "dataset", "run"):
-            if not WORD.fullmatch(getattr(self, key)):
+            if not WORD.fullmatch(getattr(self.measurement, key)):
                 raise ValueError(f"{key}: expected letters, digits and _.+-.")
-        for key, texts in (
-            ("names", self.names),
-            ("classes", self.classes),
-            ("split", [self.split]),
-        ):
+        for key, texts in (("names", self.names), ("classes", self.classes)):
             if len(set(texts)) < len(texts) or any(map(CONTROL.search, texts)):
                 raise ValueError(f"{key}: expected different texts without control characters.")
 
@@ -197,3 +205,8 @@ def convention(every: Iterable[Counts]) -> Absent:
             "absent: the counts use both conventions. Choose absent=released or absent=exclude."
         )
     return found.pop()
+
+
+def read_measurement(path: Path) -> Measurement:
+    """What a file of counts is of; its counts are not read. InputError: as `Counts.load`."""
+    return ARCHIVE.read_text(path, MEASUREMENT, Measurement.from_json)

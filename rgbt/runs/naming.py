@@ -86,22 +86,6 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
     return Description(name, tags, params, command)
 
 
-def row_name(corruption: str) -> str:
-    """The name of a corruption in files of counts and rows of tables.
-
-    Args:
-        corruption: ``NAME`` or ``NAME:IMAGE`` with the image "rgb", "thermal" or "both", such as
-            "noise:rgb".
-
-    Returns:
-        "noise_rgb"; "noise" of both images; "rgb_removed" and "thermal_removed" of a missing one.
-    """
-    name, _, image = corruption.partition(":")
-    if image in ("", "both"):
-        return name
-    return f"{image}_{name}" if name == "removed" else f"{name}_{image}"
-
-
 def tags_from_environment() -> dict[str, str]:
     """The MLflow tags that a sweep gives to the run that it requests (`TAGS`).
 

@@ -13,7 +13,8 @@ import numpy as np
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
 from rgbt.files.plain_files import check_links
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, read_measurement
+from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.named import value
 from rgbt.metrics.names import CA, CA_RELEASED, consistency, in_percent, subset
@@ -29,9 +30,11 @@ from rgbt.runs.folder import (
     read_result,
 )
 from rgbt.runs.provenance import commit_of, machine_name, other_code
+from rgbt.terminal import warn
 
-# The checkpoint of evaluations, and the pattern of the counts that a run ended with.
-CHECKPOINT, ALL_COUNTS = "best.pt", "counts_*.npz"
+# Files of counts in a run folder: of what the run ended with, and of what was measured since.
+COUNTS = ("counts_*.npz", "evaluations/*.npz")
+OWN = "counts_test.npz"
 
 
 @dataclass(frozen=True)
@@ -130,8 +133,8 @@ class RunResult:
 
         Args:
             split: "test" and the split that chose the checkpoint (usually "val") are always there;
-                ``rgbt evaluate run=... split=... out=RUN_FOLDER/counts_SPLIT.npz`` adds others.
-                Or a file of the run folder: "evaluations/test_rgb.npz".
+                ``rgbt evaluate run=... split=...`` adds others. Or a file of the run folder:
+                "evaluations/test_rgb.npz" (`measurements`).
 
         Raises:
             InputError: the run has no such counts, or the file is damaged.
@@ -143,16 +146,24 @@ class RunResult:
             return counts
         how = "rerun the command of the run to finish it"
         if self.is_finished:
-            how = f"write them with: rgbt evaluate run={self.folder} split={split} out={path}"
+            how = f"write them with: rgbt evaluate run={self.folder} split={split}"
         raise InputError(f"{self.folder} has no counts of the split '{split}'; {how}.")
+
+    def measurements(self) -> dict[str, Measurement]:
+        """Files of counts inside the folder, and what they are of; a damaged one with a warning."""
+        found = {}
+        for path in sorted(path for pattern in COUNTS for path in self.folder.glob(pattern)):
+            try:
+                found[path.relative_to(self.folder).as_posix()] = read_measurement(path)
+            except InputError as error:
+                warn(f"{path} is left out: {error}")
+        return found
 
     def _check_fits(self, counts: Counts, path: Path) -> None:
         """InputError: counts of another run, or not of the labels that its own counts are of."""
         advice = "restore the file of this run, or give its folder the name of the run"
-        if counts.run not in ("", self.key) and not self.run_id:
-            raise InputError(
-                f"{path} has counts of the run {counts.run}, not of {self.key}; {advice}."
-            )
+        if (run := counts.measurement.run) not in ("", self.key) and not self.run_id:
+            raise InputError(f"{path} has counts of the run {run}, not of {self.key}; {advice}.")
         if protocol_of(counts.partition) and counts.counts.shape[1] % (len(counts.classes) + 1):
             raise InputError(f"{path} has other rows than {counts.partition}; {advice}.")
         result = read_result(self.folder)
@@ -184,8 +195,9 @@ class RunResult:
         InputError: a score differs or is missing, or a file is damaged. A score whose counts the
         folder does not hold cannot be compared.
         """
-        for path in (*self.folder.glob(ALL_COUNTS), *self.folder.glob("evaluations/**/*.npz")):
-            self.counts(path.relative_to(self.folder).as_posix())
+        for pattern in COUNTS:
+            for path in self.folder.glob(pattern):
+                self.counts(path.relative_to(self.folder).as_posix())
         metric = {
             key: each for key, each in self.settings.get("metric", {}).items() if key != "_target_"
         }
@@ -209,28 +221,15 @@ class RunResult:
 
     def _further_scores(self) -> Iterator[tuple[str, float]]:
         """Scores of other views, heads and pairs of frames, by their names in ``result.json``."""
-        for path in sorted(self.folder.glob("counts_test_*.npz")):
-            counts = self.counts(path.name)
-            for name, score in summary(counts, counts.absent).items():
-                yield subset(path.stem.removeprefix("counts_test_"), name), score
-        for path in sorted(self.folder.glob("evaluations/consistency_*_test.npz")):
-            counts = self.counts(f"evaluations/{path.name}")
-            protocol = protocol_of(counts.partition)
-            for name in HEADLINES[protocol][:2] if protocol else ():
-                key = consistency(CA if name == CA_RELEASED else name, protocol)
-                yield key, value(name, counts, counts.absent) / 100
-
-    def has_counts(self, path: str, *, other_dataset: bool = False) -> bool:
-        """Whether the file `path` of the folder holds test counts that this training made.
-
-        With `other_dataset` they may be of another data set than the run's own.
-        """
-        # Compared with the checkpoint: a run may write an evaluation before its result.
-        file, best = self.folder / path, self.folder / CHECKPOINT
-        if not file.exists() or (best.exists() and file.stat().st_mtime < best.stat().st_mtime):
-            return False
-        try:
-            counts = Counts.load(file)
-        except InputError:  # not readable: the evaluation is repeated
-            return False
-        return counts.split == "test" and (other_dataset or counts.dataset == self.fingerprint)
+        for path, of in self.measurements().items():
+            if of.split != "test" or len(of.changed) != 1:
+                continue
+            counts = self.counts(path)
+            if (protocol := protocol_of(of.partition)) is not None:
+                for name in HEADLINES[protocol][:2]:
+                    key = consistency(CA if name == CA_RELEASED else name, protocol)
+                    yield key, value(name, counts, counts.absent) / 100
+            elif of.changed[0] in ("view", "head"):
+                part = of.view if of.changed[0] == "view" else f"{of.head}_head"
+                for name, score in summary(counts, counts.absent).items():
+                    yield subset(part, name), score

@@ -50,8 +50,6 @@ FILES = (
     "counts_*.npz",
     "figures/*.png",
     "evaluations/*.npz",
-    "evaluations/robustness/*/*.npz",
-    "evaluations/robustness/*/*.json",
 )
 # Files whose content is sent in another form.
 READ = ("run.json", "metrics.jsonl", "tables.json")

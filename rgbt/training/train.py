@@ -16,22 +16,23 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from rgbt.assembly.load_run import with_weights
-from rgbt.assembly.session import names_key
+from rgbt.assembly.session import Session, names_key
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training, validate
 from rgbt.checks import InputError
 from rgbt.data.domains import TestedHead
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.trainer import Loaded, Trainer
-from rgbt.evaluation.prediction import view_of
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import (
-    EvaluationResult,
-    evaluate,
+from rgbt.evaluation.measure import (
+    Measured,
     legend_of,
+    measure,
+    measurement_of,
     panel_names,
-    result_tables,
+    path_of,
 )
+from rgbt.evaluation.predictor import view_of
+from rgbt.evaluation.tables import result_tables
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.processes import agreed, alone
@@ -95,7 +96,7 @@ class Training:
         self.spec, self.upstream_of = spec, upstream_of
         self.description = describe(spec, extra_tags)
         self._is_first = True
-        self._selected: dict[str, Counts] = {}  # counts of the last evaluation in training
+        self._selected: list[Counts] = []  # counts of the last evaluation in training
 
     @alone()
     def validate(self) -> None:
@@ -111,9 +112,8 @@ class Training:
             session = with_weights(run, run.folder, checkpoint, run.plain)
             from rgbt.evaluation.images import write_pseudo_labels  # few runs have a teacher
 
-            request = EvaluationRequest(split=domain.split, view=domain.teacher_view)
-            key, threshold = run.folder.name, domain.threshold
-            write_pseudo_labels(session, key, request, folder, threshold=threshold)
+            wanted = measurement_of(session, domain.split, domain.teacher_view)
+            write_pseudo_labels(session, wanted, folder, threshold=domain.threshold)
 
     def complete(self) -> None:
         """Train the run to its end, or resume it, and print its result.
@@ -167,7 +167,7 @@ class Training:
             agreed(None)  # process 0 has written the best checkpoint
             checkpoints = Checkpoints(self.folder.path)
             restore_weights(session.model, checkpoints.load_best(state), checkpoints.best)
-            pairs = self._consistency() if self._is_first else {}
+            pairs = self._consistency(state) if self._is_first else {}
             selected = self._selection_scores(state)
             reached = {} if selected is None else {"val": selected}
             reached["test"] = self._test(state, *pairs.get("test", (None, {})))
@@ -241,7 +241,8 @@ class Training:
 
         def validate(step: int) -> float:
             assert split is not None, "called only where there is one"
-            result, of_target = self._evaluate(trainer.weights.network, split, self._selected)
+            network = trainer.weights.network
+            result, of_target = self._evaluate(network, step, split, self._selected)
             values = scores.summary(result.counts, session.regions.absent) | of_target
             self.folder.append(step, "val", values)
             state.skip(result.skipped)
@@ -274,28 +275,41 @@ class Training:
             yield batch
 
     def _evaluate(
-        self, network: nn.Module, split: str, counts: dict[str, Counts], keep: Sequence[str] = ()
-    ) -> tuple[EvaluationResult, dict[str, float]]:
+        self,
+        network: nn.Module,
+        step: int,
+        split: str,
+        counts: list[Counts],
+        keep: Sequence[str] = (),
+    ) -> tuple[Measured, dict[str, float]]:
         """Evaluate a split, also in the view of the target where that is not the source's.
 
-        The counts are added to `counts`. Returns the evaluation, and the mIoU in the view of the
+        `counts` are replaced by those. Returns the evaluation, and the mIoU in the view of the
         target by names that begin with the view.
         """
-        session = self.setup.session
-        result = evaluate(session, network, EvaluationRequest(split=split, keep=tuple(keep)))
-        counts[split] = result.counts
+        session = self._session(network, step)
+        result = measure(session, measurement_of(session, split), keep=keep)
+        counts[:] = [result.counts]
         view = None if session.domains.target is None else session.domains.target.view
         if view is None or view == view_of(session):
             return result, {}
-        found = evaluate(session, network, EvaluationRequest(split=split, view=view)).counts
-        counts[f"{split}_{view}"] = found
+        found = measure(session, measurement_of(session, split, view)).counts
+        counts.append(found)
         values = scores.summary(found, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return result, {names.subset(view, name): values[name] for name in kept if name in values}
 
-    def _save(self, counts: Mapping[str, Counts]) -> None:
-        for name, each in counts.items() if self._is_first else ():
-            each.save(self.folder.path / counts_name(name))
+    def _session(self, network: nn.Module, step: int) -> Session:
+        """The session with a network of this run, after a step."""
+        path = self.folder.path
+        return replace(self.setup.session, model=network, step=step, folder=path, run=path.name)
+
+    def _save(self, every: Sequence[Counts]) -> None:
+        session = self._session(self.setup.session.model, 0)
+        for counts in every if self._is_first else ():
+            path = path_of(session, counts.measurement)
+            path.parent.mkdir(exist_ok=True)
+            counts.save(path)
 
     def _selection_scores(self, state: State) -> dict[str, float] | None:
         """Scores of the best checkpoint on the selection split, if there is one."""
@@ -309,15 +323,14 @@ class Training:
         return scores.summary(counts, self.setup.session.regions.absent)
 
     @alone()
-    def _consistency(self) -> dict[str, tuple[ConsistencyTable, dict[str, float]]]:
+    def _consistency(self, state: State) -> dict[str, tuple[ConsistencyTable, dict[str, float]]]:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
-        session = self.setup.session
+        session = self._session(self.setup.session.model, state.best_step)
         found: dict[str, tuple[ConsistencyTable, dict[str, float]]] = {}
         if not session.consistency.sets:
             return found
         from rgbt.evaluation import temporal_consistency as frames
         from rgbt.evaluation.pair_frames import Pairing
-        from rgbt.metrics.pairs import file_name
         from rgbt.tracking.pair_pictures import draw_pairs
 
         for kind in session.consistency.splits:
@@ -327,16 +340,13 @@ class Training:
                 continue
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
-                request = EvaluationRequest(split=split, keep=keep)
-                pairs = frames.count_pairs(session, session.model, request, Pairing("virtual"))
+                wanted = measurement_of(session, split)
+                pairs = frames.count_pairs(session, wanted, Pairing("virtual"), keep)
             except InputError as error:
                 # The training is done: an error of an extra evaluation must not lose it.
                 info(f"{error} Consistency was not measured; see `rgbt consistency`.")
                 continue
-            for protocol, counts in pairs.counts.items():
-                path = self.folder.path / file_name(protocol, split, session.consistency.mark)
-                path.parent.mkdir(exist_ok=True)
-                counts.save(path)
+            self._save([*pairs.counts.values()])
             table = frames.consistency_table(pairs.counts, session.regions.absent)
             found[kind] = table, frames.consistency_values(table)
             if pairs.kept:
@@ -347,10 +357,10 @@ class Training:
         self, state: State, pairs: ConsistencyTable | None, of_pairs: dict[str, float]
     ) -> dict[str, float]:
         """Counts, tables and figures of the best checkpoint on the test split; its scores."""
-        session, counts = self.setup.session, dict[str, Counts]()
+        session, counts = self.setup.session, list[Counts]()
         keep = panel_names(session.dataset, "test")
-        result, beside = self._evaluate(session.model, "test", counts, keep)
-        beside |= self._by_other_head(counts)
+        result, beside = self._evaluate(session.model, state.best_step, "test", counts, keep)
+        beside |= self._by_other_head(counts, state.best_step)
         state.skip(result.skipped)
         self._save(counts)
         values = scores.summary(result.counts, session.regions.absent) | beside | of_pairs
@@ -376,19 +386,18 @@ class Training:
         draw_region_heat(heat, self.folder.figure_path("regions"))
         return values
 
-    def _by_other_head(self, counts: dict[str, Counts]) -> dict[str, float]:
+    def _by_other_head(self, counts: list[Counts], step: int) -> dict[str, float]:
         """The mIoU at night of the head that is not selected for the night, named after the head.
 
         Nothing in a run without a head for the day and another one for the night. Its counts are
         added to `counts`.
         """
-        session = self.setup.session
+        session = self._session(self.setup.session.model, step)
         if session.domains.target_is != "night":
             return {}
         head: TestedHead = "target" if session.domains.tested_head == "source" else "source"
-        request = EvaluationRequest(split="test", head=head)
-        found = evaluate(session, session.model, request).counts
-        counts[f"test_{head}_head"] = found
+        found = measure(session, measurement_of(session, "test", head=head)).counts
+        counts.append(found)
         values = scores.summary(found, session.regions.absent)
         at_night = names.subset(names.NIGHT, names.MIOU)
         return {names.by_head(head, at_night): values[at_night]} if at_night in values else {}

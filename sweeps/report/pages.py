@@ -30,7 +30,6 @@ from sweeps.rendering.claims import (
 )
 from sweeps.rendering.publish import drawn_of, grid_of, grids_of
 from sweeps.rendering.table import MARKDOWN
-from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.request import TAG
 from sweeps.verdicts.stored import TableResult, TableResults
@@ -206,7 +205,7 @@ class Report:
     def _scores(self, run: RunResult) -> dict[str, Any]:
         """One line for each group of runs: its seeds, scores, time and tables."""
         tags, stored = run.tags, self.source.stored
-        counts, basis = stored.counts(run, OWN_COUNTS), stored.basis({"": {0: run}})
+        counts, basis = stored.counts(run, ()), stored.basis({"": {0: run}})
         return {
             "method": tags.get(GROUP, run.key),
             "dataset": counts.dataset,

@@ -10,22 +10,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rgbt.checks import InputError
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import details_of_metric, value
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words, counts_of
 from sweeps.point import Outcome
 from sweeps.table.table import Column, Form, Row, Table
 
 NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
-# Path, in the run folder, of the counts of the evaluation that every run makes itself.
-OWN_COUNTS = "counts_test.npz"
-
 NO_SEED = "-1"  # seed of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 
 CellId = tuple[str, str]  # (label of the row, name of the column)
 Value = float | str  # a score, or the reason why there is none
-Reader = Callable[[RunResult, str], Counts]  # reads the counts of a run by their path
+Reader = Callable[[RunResult, Words], Counts]  # reads the counts of a measurement of a run
 
 
 @dataclass(frozen=True)
@@ -53,29 +51,28 @@ def metric_of(column: Column, row: Row) -> str:
     return str(column.metric).format_map(row.settings)
 
 
-def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
-    """The evaluation that the column needs; None: the one that every run makes itself."""
+def words_of(column: Column, table: Table) -> Words:
+    """The measurement that a column needs; (): the test that every run ends with."""
     if column.frames is not None:
-        return ExtraEvaluation(frames=column.frames)
-    kind = details_of_metric(str(column.metric))
-    keys = ("modality", "head", "corruption", "severity", "batch_norm", "batch_norm_splits")
-    same: dict[str, Any] = {key: getattr(column, key) for key in keys}
-    needed = ExtraEvaluation(regions=table.regions, details=kind, **same)
-    return None if needed == ExtraEvaluation() else needed
-
-
-def world_evaluations(table: Table, row: Row) -> dict[str, ExtraEvaluation]:
-    """Name -> evaluation of the row's network in every world of `Row.tested_in`."""
-    return {
-        name: ExtraEvaluation(regions=table.regions, world=name, dataset=overrides)
-        for name, overrides in row.tested_in.items()
+        return (f"frames={column.frames}",)
+    given: dict[str, Any] = {
+        "modality": column.modality,
+        "regions": table.regions,
+        "head": column.head,
+        "corruption": column.corruption or "",
+        "severity": "" if column.severity is None else f"{column.severity:g}",
+        "batch_norm": column.batch_norm,
+        "batch_norm_splits": ",".join(column.batch_norm_splits),
+        "details": details_of_metric(str(column.metric)) or "",
     }
+    usual = ("", "default", "as trained")
+    return tuple(f"{key}={value}" for key, value in given.items() if value not in usual)
 
 
-def counts_path(column: Column, table: Table) -> str:
-    """Path of the column's counts, relative to the run folder."""
-    evaluation = evaluation_of(column, table)
-    return OWN_COUNTS if evaluation is None else evaluation.path
+def world_words(table: Table, row: Row) -> dict[str, Words]:
+    """Name -> measurement of the row's network in every world of `Row.tested_in`."""
+    usual = words_of(Column(name=names.MIOU, metric=names.MIOU), table)
+    return {name: (*usual, *overrides) for name, overrides in row.tested_in.items()}
 
 
 def is_counted(column: Column) -> bool:
@@ -106,26 +103,26 @@ def row_cells(
 
 def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[str, Value]:
     """Every column's value of one run."""
-    counts: dict[str, Counts | str] = {}
+    counts: dict[Words, Counts | str] = {}
     values: dict[str, Value] = {}
     columns = table.columns_of(row)
     for column in filter(is_counted, columns):
-        path = counts_path(column, table)
-        if path not in counts:
-            counts[path] = _counts(outcome, path, reader)
-        values[column.name] = _value(metric_of(column, row), counts[path], table)
+        words = words_of(column, table)
+        if words not in counts:
+            counts[words] = _counts(outcome, words, reader)
+        values[column.name] = _value(metric_of(column, row), counts[words], table)
     for column in columns:
         if column.sources:
             values[column.name] = derived(column, [values[name] for name in column.sources])
     return values
 
 
-def _counts(outcome: Outcome, path: str, reader: Reader) -> Counts | str:
+def _counts(outcome: Outcome, words: Words, reader: Reader) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
     run = outcome.results[0]
     try:
-        return outcome.missing.get(path) or reader(run, path)
+        return outcome.missing.get(words) or reader(run, words)
     except (InputError, OSError) as error:
         return str(error).replace(f"{run.folder}/", "")  # equal reasons of seeds are joined
 
@@ -213,7 +210,7 @@ def score(
     *,
     scale: str,
     sizes: Mapping[CellId, TableCell] | None = None,
-    reader: Reader = lambda run, path: run.counts(path),
+    reader: Reader = counts_of,
 ) -> ScoredTable:
     """Compute every cell of the rows with `runs`; `sizes` are those of networks."""
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one

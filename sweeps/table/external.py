@@ -12,7 +12,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,14 @@ from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
 from rgbt.config.options import with_home
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import write_json
+from rgbt.metrics.counts import read_measurement
 from rgbt.metrics.pair_list import PAIR_LIST
 from rgbt.runs.provenance import code
-from rgbt.runs.result import RunResult
+from rgbt.runs.result import OWN, RunResult
 from rgbt.terminal import info
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words, command_of, stored_at
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import OWN_COUNTS, evaluation_of, is_counted
+from sweeps.table.cells import is_counted, words_of
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
 from sweeps.worker.processes import run_command
@@ -146,73 +147,81 @@ class ExternalRun:
         "failed" if there are none; one that fails beside others is the reason of its columns alone.
         """
         columns = filter(is_counted, table.columns_of(self.row))
-        evaluations = dict.fromkeys(evaluation_of(column, table) for column in columns)
-        reasons: dict[str, str] = {}
-        for each in sorted(evaluations, key=lambda extra: extra is not None):  # plain images first
-            extra = each or ExtraEvaluation()
-            path = OWN_COUNTS if each is None else extra.path
-            if OWN_COUNTS in reasons:  # nothing else can be made of it
-                reasons[path] = reasons[OWN_COUNTS]
-            elif not (self.folder / path).is_file():
-                info(f"row '{self.row.label}': evaluating {self.given.path} ({extra.label})")
-                reason = self._make(extra, path, trust)
-                reasons |= {path: reason} if reason else {}
+        needed = dict.fromkeys(words_of(column, table) for column in columns)
+        result, reasons = RunResult(self.folder), dict[Words, str]()
+        # Plain images first: other measurements of single frames are found by comparison with them.
+        first = [] if all(map(_of_frames, needed)) else [()]
+        for words in dict.fromkeys([*first, *needed]):
+            if () in reasons:  # nothing else can be made of it
+                reasons[words] = reasons[()]
+            elif not self._has(result, words):
+                what = " ".join(words) or "test"
+                info(f"row '{self.row.label}': evaluating {self.given.path} ({what})")
+                if reason := self._make(result, words, trust):
+                    reasons[words] = reason
         point = Point(self.row.label, ())
-        if len(reasons) == len(evaluations):
+        if all(words in reasons for words in needed):
             return Outcome(point, "failed", next(iter(reasons.values()), "no column is a score"))
-        return Outcome(point, "finished", results=(RunResult(self.folder),), missing=reasons)
+        return Outcome(point, "finished", results=(result,), missing=reasons)
 
-    def _make(self, extra: ExtraEvaluation, path: str, trust: str) -> str:
-        """Run the command that makes the counts of `path`; why it failed, or ""."""
-        words, reason = self._command(extra)
+    def _has(self, result: RunResult, words: Words) -> bool:
+        path = stored_at(result, words)
+        return path is not None and (self.folder / path).is_file()
+
+    def _make(self, result: RunResult, words: Words, trust: str) -> str:
+        """Run the command that makes the counts of a measurement; why it failed, or ""."""
+        command, reason = self._command(words)
         if reason:
             return reason
         log = self.folder / "log.txt"
         folders = ",".join(filter(None, (own_folders(), str(self.folder / "conf"))))
         with tempfile.TemporaryDirectory(dir=self.folder) as made:
-            out = made
-            if words[0] == "rgbt.evaluate":
-                out = f"{made}/{Path(OWN_COUNTS if path == OWN_COUNTS else extra.out).name}"
+            is_one = command[0] == "rgbt.evaluate"
             own = [f"trust={trust}"] if trust and self.given.kind == "weights" else []
             with searching([f"{SEARCH_PATH}=[{folders}]"]):
-                reason = run_command((*words, *own, f"out={out}"), log)
-            found = sorted(Path(made).glob("*_*.npz"))
-            if words[0] == "analysis.score":  # it cuts images in three ways
-                metric = self._metric(extra)
+                out = f"out={made}/{OWN}" if is_one else f"out={made}"
+                reason = run_command((*command, *own, out), log)
+            found = sorted(Path(made).glob("*.npz"))
+            if command[0] == "analysis.score":  # it cuts images in three ways
+                metric = self._metric(words)
                 found = [Path(made, f"counts_{metric.partition}{metric.regions}.npz")]
             for file in () if reason else found:
-                is_own = file.name.startswith("counts_")
-                target = self.folder / (path if is_own else f"evaluations/{file.name}")
+                name = f"evaluations/{read_measurement(file).file_name}" if words else OWN
+                target = self.folder / name
                 target.parent.mkdir(exist_ok=True)
                 file.replace(target)
-        if not reason and not (self.folder / path).is_file():
+        if not reason and not self._has(result, words):
             reason = f"the command wrote no counts; see {log}"
         return reason
 
-    def _command(self, extra: ExtraEvaluation) -> tuple[tuple[str, ...], str]:
-        """The command of an evaluation without its output, or the reason why there is none."""
-        regions = [f"metric={NODE_FILE}"] if extra.regions == "as trained" else []
+    def _command(self, words: Words) -> tuple[Words, str]:
+        """The command of a measurement without its output, or the reason why there is none."""
+        is_of_frames = _of_frames(words)
+        is_cut = any(word.startswith("regions=") for word in words)
+        regions = [] if is_cut else [f"metric={NODE_FILE}"]
         if self.given.kind == "weights":
-            of_network = regions if self.row.network and extra.frames is None else []
+            of_network = regions if self.row.network and not is_of_frames else []
             weights = f"model.weights={self.given.path}"
-            return (*extra.command, *self.arguments, *of_network, weights), ""
+            return (*command_of(words), *self.arguments, *of_network, weights), ""
         of_folder = (f"predictions={self.given.path}", *self.arguments)
-        if extra.frames is not None:
+        if is_of_frames:
             has_pairs = (self.given.path / PAIR_LIST).is_file()
-            return (*extra.command, *of_folder), "" if has_pairs else NEEDS_PAIRS
-        plain = ExtraEvaluation(regions=extra.regions)
-        if extra not in (plain, replace(plain, modality="rgbt")):
+            return (*command_of(words), *of_folder), "" if has_pairs else NEEDS_PAIRS
+        if any(not word.startswith("regions=") and word != "modality=rgbt" for word in words):
             return (), NEEDS_NETWORK
-        metric = self._metric(extra)
+        metric = self._metric(words)
         if metric.get("aspect") == "released_3_4":
-            return (), f"predictions are not counted in regions {extra.regions}; choose ring5"
+            return (), f"predictions are not counted in regions {metric.regions}; choose ring5"
         return ("analysis.score", "resamples=0", f"regions={metric.regions}", *of_folder), ""
 
-    def _metric(self, extra: ExtraEvaluation) -> Any:
-        """The node of the configuration that says how an evaluation cuts images into regions."""
-        if extra.regions == "as trained":
-            return self.config.metric
-        return compose([f"metric={extra.regions}"]).metric
+    def _metric(self, words: Words) -> Any:
+        """The node of the configuration that says how a measurement cuts images into regions."""
+        names = [word.removeprefix("regions=") for word in words if word.startswith("regions=")]
+        return compose([f"metric={names[0]}"]).metric if names else self.config.metric
+
+
+def _of_frames(words: Words) -> bool:
+    return any(word.startswith("frames=") for word in words)
 
 
 def content_hash(path: Path) -> str:

@@ -12,9 +12,9 @@ from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from rgbt.runs.naming import MACHINE_OVERRIDES
 from rgbt.runs.specify import CHECKOUT
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words
 from sweeps.point import Point
-from sweeps.table.cells import evaluation_of, is_counted, world_evaluations
+from sweeps.table.cells import is_counted, words_of, world_words
 from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
@@ -109,15 +109,16 @@ class TableRequest:
         machine = (*MACHINE_OVERRIDES, f"{CHECKOUT}=")
         return [word for word in typed if not word.lstrip("+~").startswith(machine)]
 
-    def evaluations(self, labels: Collection[str] | None = None) -> tuple[ExtraEvaluation, ...]:
-        """Further evaluations of the runs of the rows `labels`; None: of all rows that are run."""
+    def evaluations(self, labels: Collection[str] | None = None) -> tuple[Words, ...]:
+        """Further measurements of the runs of the rows `labels`; None: of all that are run."""
         rows = self.table.runnable_rows
         named = [row for row in rows if labels is None or row.label in labels]
         names = {column.name for row in named for column in self.table.columns_of(row)}
         counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
-        evaluations = (evaluation_of(column, self.table) for column in counted)
-        worlds = (each for row in named for each in world_evaluations(self.table, row).values())
-        return tuple(dict.fromkeys([*filter(None, evaluations), *worlds]))
+        every = [words_of(column, self.table) for column in counted]
+        for row in named:
+            every += world_words(self.table, row).values()
+        return tuple(dict.fromkeys(filter(None, every)))
 
     def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
         """The outcome of every row and seed."""

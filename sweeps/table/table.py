@@ -16,9 +16,10 @@ from rgbt.config.compose import available, chosen_scale
 from rgbt.config.values import check_value
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
+from rgbt.metrics.measurement import Statistics
 from rgbt.metrics.named import PAIR_SCORES, parse
 from rgbt.metrics.pairs import Protocol
-from sweeps.evaluation import BatchNorm, Head
+from sweeps.evaluation import Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
@@ -53,7 +54,7 @@ class Column(Strict):
         head: of a network with a head per domain, the one that predicts.
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``.
         severity: of the corruption; may be omitted if the corruption has a single one.
-        batch_norm: statistics of batch normalisation, see `sweeps.evaluation.BatchNorm`.
+        batch_norm: statistics of batch normalisation, see `rgbt.metrics.measurement.Statistics`.
         batch_norm_splits: splits whose images give them; (): the test split.
         printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
@@ -69,7 +70,7 @@ class Column(Strict):
     head: Head = "as trained"
     corruption: str | None = None
     severity: float | None = None
-    batch_norm: BatchNorm = "as trained"
+    batch_norm: Statistics = "as trained"
     batch_norm_splits: tuple[str, ...] = ()
     printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"

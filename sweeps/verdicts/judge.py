@@ -22,15 +22,16 @@ from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
+from sweeps.evaluation import Words, counts_of, stored_at
 from sweeps.point import Outcome
 from sweeps.table.cells import (
     CellId,
     ScoredTable,
     TableCell,
-    counts_path,
     is_counted,
     metric_of,
-    world_evaluations,
+    words_of,
+    world_words,
 )
 from sweeps.table.claim import HIGHER, LOWER, Claim
 from sweeps.table.design import sign_of
@@ -65,17 +66,21 @@ class StoredRuns:
     """Counts and settings of finished runs, each file read once."""
 
     def __init__(self) -> None:
-        self._counts: dict[tuple[str, str], Counts] = {}
+        self._counts: dict[tuple[str, Words], Counts] = {}
         self._settings: dict[str, tuple[str, str, str, str, str]] = {}
 
-    def counts(self, run: RunResult, path: str) -> Counts:
-        """Counts of a run; InputError where they are missing, damaged or cannot be read."""
-        if (run.key, path) not in self._counts:
+    def counts(self, run: RunResult, words: Words) -> Counts:
+        """Counts of a measurement of a run; InputError where they are missing or damaged."""
+        if (run.key, words) not in self._counts:
             try:
-                self._counts[run.key, path] = run.counts(path)
+                self._counts[run.key, words] = counts_of(run, words)
             except OSError as error:
                 raise InputError(f"run {run.key}: {error}") from error
-        return self._counts[run.key, path]
+        return self._counts[run.key, words]
+
+    def has(self, run: RunResult, words: Words) -> bool:
+        """Whether a run has the counts of a measurement."""
+        return (run.key, words) in self._counts or stored_at(run, words) is not None
 
     def basis(self, rows: Mapping[str, Mapping[int, RunResult]]) -> Basis:
         """What the runs of rows, by seed, are about; of several kinds of runs, all kinds."""
@@ -353,20 +358,20 @@ class TableJudge:
         for part, column in base_scores(self.table, row, cell.column):
             if not is_counted(column):
                 raise InputError(f"column '{column.name}' is not a score of images.")
-            path = counts_path(column, self.table)
+            words = words_of(column, self.table)
             if cell.world:
                 plain = Column(name=names.MIOU, metric=names.MIOU)
-                if path != counts_path(plain, self.table):
+                if words != words_of(plain, self.table):
                     raise InputError(f"'{column.name}' is no score of the plain test images.")
-                path = world_evaluations(self.table, row)[cell.world].path
-            # Another table may have trained further seeds, without this evaluation.
-            counted = {s: run for s, run in finished.items() if (run.folder / path).is_file()}
+                words = world_words(self.table, row)[cell.world]
+            # Another table may have trained further seeds, without this measurement.
+            counted = {s: run for s, run in finished.items() if self.stored.has(run, words)}
             runs_of = counted or finished
             yield Term(
                 weight=cell.weight * part,
                 metric=metric_of(column, row),
-                counts={seed: self.stored.counts(run, path) for seed, run in runs_of.items()},
-                keys={seed: f"{run.key}/{path}" for seed, run in runs_of.items()},
+                counts={seed: self.stored.counts(run, words) for seed, run in runs_of.items()},
+                keys={seed: f"{run.key}/{' '.join(words)}" for seed, run in runs_of.items()},
             )
 
     def marks(self, scored: ScoredTable, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:

@@ -65,7 +65,7 @@ class Planner:
         runs = tuple(self.specify((*self.base, *overrides)) for overrides in point.runs())
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            parts = [[run.key for run in runs], [vars(each) for each in point.evaluations]]
+            parts = [[run.key for run in runs], point.evaluations]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
         label = with_pixels(point.label, runs[0].scale.pixel_factor)
         fingerprints = {run.key: self.fingerprint(run) for run in runs}

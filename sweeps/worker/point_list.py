@@ -13,6 +13,7 @@ from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from sweeps import attributes as names
+from sweeps.evaluation import stored_at
 from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
 from sweeps.settings import SweepSettings
 from sweeps.worker import storage as stores
@@ -211,7 +212,7 @@ def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
 def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
     """Whether there are runs, and all further evaluations of them."""
     wanted = plan.point.evaluations
-    return bool(results) and all(each.is_stored(result) for result in results for each in wanted)
+    return bool(results) and all(stored_at(result, each) for result in results for each in wanted)
 
 
 def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:

@@ -18,7 +18,7 @@ from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tracker import Tracking
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words, stored_at
 
 
 @dataclass
@@ -34,9 +34,7 @@ class RunStore:
     archive: Path | None = None
     _is_unreachable: bool = field(default=False, init=False)
 
-    def find(
-        self, key: str, dataset: str, evaluations: Sequence[ExtraEvaluation] = ()
-    ) -> RunResult | None:
+    def find(self, key: str, dataset: str, evaluations: Sequence[Words] = ()) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.
 
         An archived run cannot be evaluated further: it counts if it has all `evaluations`.
@@ -46,7 +44,7 @@ class RunStore:
         result = RunResult(folder) if is_finished(folder) else None
         if result is None and self.archive and (path := self.archive / f"{key}.zip").exists():
             archived = unpack(path)
-            is_whole = all(each.is_stored(archived) for each in evaluations)
+            is_whole = all(stored_at(archived, each) for each in evaluations)
             result = archived if is_whole and archived.fingerprint == dataset else None
         if result is None:
             return None

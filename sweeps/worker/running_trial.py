@@ -16,7 +16,7 @@ from rgbt.files.atomic import is_held
 from rgbt.runs.folder import MetricLine, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words, command_of, stored_at
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.processes import LocalJob, failure_reason
 from sweeps.worker.run_store import RunStore
@@ -143,9 +143,9 @@ class RunningTrial:
                     "data set or your own code changed during the sweep; rerun the command"
                 )
             self.runs.tag(result, self.plan.point.tags)
-            for evaluation in evaluations:
-                if not evaluation.is_stored(result):
-                    yield from self._evaluate(run, result, evaluation)
+            for words in evaluations:
+                if stored_at(result, words) is None:
+                    yield from self._evaluate(run, result, words)
             self._results = (*self._results, result)
 
     def _train(self, run: RunSpec) -> Iterator[None]:
@@ -166,25 +166,20 @@ class RunningTrial:
             if not is_finished(folder) and not is_held(folder / "lock"):
                 raise TrialError(reason)
 
-    def _evaluate(
-        self, run: RunSpec, result: RunResult, evaluation: ExtraEvaluation
-    ) -> Iterator[None]:
-        self.status = f"evaluating {evaluation.label}"
-        module, *arguments = evaluation.command
-        # Each protocol of consistency has a fixed file inside the run folder.
-        out = f"out={result.folder / evaluation.out}"
+    def _evaluate(self, run: RunSpec, result: RunResult, words: Words) -> Iterator[None]:
+        self.status = f"evaluating {' '.join(words)}"
+        module, *arguments = command_of(words)
         command = (
             module,
             f"run={result.folder}",
             *arguments,
-            out if evaluation.frames is None else f"runs_dir={result.folder.parent}",
             *([f"trust={self.trust}"] if self.trust else []),
             # The run may come from a machine with other folders.
             *(word for word in run.overrides if word.startswith(FOLDERS)),
         )
         reason = yield from self._run(command, result.key)
-        if reason is not None or not evaluation.is_stored(result):
-            raise TrialError(reason or f"it wrote no {evaluation.path}")
+        if reason is not None or stored_at(result, words) is None:
+            raise TrialError(reason or f"it wrote no counts of {' '.join(words)}")
         self.runs.sync(result)
 
     def _run(self, command: Sequence[str], key: str) -> Generator[None, None, str | None]:
