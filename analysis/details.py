@@ -100,7 +100,8 @@ def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]
     for named, found in zip(opened, every, strict=True):
         missing = [details_of(key[1]) for key in keys if key not in found]
         if missing or not (is_more or named.run is None):
-            views = "modality=all" if len({view for view, _ in keys}) != 1 else "..."
+            is_one = is_more and len({view for view, _ in keys}) == 1
+            views = "..." if is_one else "modality=all"
             kinds = ",".join(dict.fromkeys(each.kind for each in missing if each)) or "boundary"
             folder = named.path.parent
             raise InputError(

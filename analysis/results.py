@@ -319,15 +319,15 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     if not (frames or condition):
         return Evaluation(run.folder / counts_name(split), run.counts(split), run)
-    known = []
-    for each in evaluations_of(run, split):
-        protocol = protocol_of(each.counts.partition)
-        is_usual = "partition" not in each.counts.measurement.changed
-        if (protocol == frames) if frames else is_usual:
-            known.append(each)
-    name, *severity = (condition or CLEAN).split(" ", 1)
+    known = list(evaluations_of(run, split))
+    name, *severity = condition.split(" ", 1)
     wanted = " ".join((row_name(name), *severity))
-    chosen = [each for each in known if wanted in (each.condition, each.said)]
+    chosen = [each for each in known if condition and wanted in (each.condition, each.said)]
+    if frames:
+        known = [each for each in known if protocol_of(each.counts.partition) == frames]
+        chosen = [each for each in known if each.condition == each.counts.partition]
+        # Other views than the published ones are marked, as all next frames.
+        chosen = [each for each in chosen if "-" not in each.counts.partition] or chosen
     if len(chosen) != 1:
         said = ", ".join(each.said for each in known) or "none"
         what = f"condition={condition}" if condition else f"frames={frames}"

@@ -130,28 +130,23 @@ def _measure(options: Options, overrides: list[str]) -> None:
         pairs, data = count_predictions(folder, exported, options, overrides, split, pairing)
         label = folder.resolve().name
     else:
-        view, _ = chosen(options.modality)
         data = session = open_named(options, overrides)
-        label = session.label
-        wanted = measurement_of(session, split, view)
+        label, wanted = session.label, measurement_of(session, split, chosen(options.modality)[0])
         is_own = wanted.is_own
         kept = pairing.pictured(session, split)
         pairs = pairs_of.count_pairs(session, wanted, pairing, kept)
     paths = {}
-    for protocol, counts in pairs.counts.items():
-        if out:
-            paths[protocol] = out / counts.measurement.file_name
-        elif not options.predictions:
-            paths[protocol] = path_of(session, counts.measurement)
+    for protocol, counts in pairs.counts.items() if out or not options.predictions else ():
+        of = counts.measurement
+        paths[protocol] = out / of.file_name if out else path_of(session, of)
     table = pairs_of.consistency_table(pairs.counts, data.regions.absent)
     views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
     title = f"Consistency of {label} ({data.dataset.name}, {split}; {options.frames}: {views})"
     print_rich(rich_table(consistency_grid(table, title)))
+    least_used = options.least_used if options.frames == "video" else 0.0
     if pairs.records:
         print_rich(rich_table(pairs_of.changes_grid(pairs.counts)))
-        least_used = options.least_used if options.frames == "video" else 0.0
-        for sentence in files.flow_sentences(pairs.records, least_used):
-            print_rich(sentence)
+        print_rich("\n".join(files.flow_sentences(pairs.records, least_used)))
     if paths:
         print_rich(path_lines(files.write_pairs(pairs, paths, data.dataset)))
     if pairing.frames == "virtual" and is_own and not out:

@@ -101,9 +101,14 @@ def main(options: Options, overrides: list[str]) -> int:
     announce_network(opened)
     by_view = {}
     for each in wanted:
-        found = measure.stored_or_measured(opened, each, details, out)
-        by_view[each.view] = next(iter(found.files.values()))
-        print_rich(tables.overview(opened, found.files, found.skipped, is_new=found.is_new))
+        files = measure.files_of(opened, each, details, out)
+        counts, note = measure.stored(opened, files), "measured before"
+        if len(counts) < len(files):
+            made = measure.measure(opened, each, details)
+            counts = measure.store(files, made, counts)
+            note = f"{len(made.skipped)} images were unreadable" if made.skipped else ""
+        by_view[each.view] = next(iter(counts.values()))
+        print_rich(tables.overview(opened, counts, note))
     if len(by_view) > 1:
         print_rich(rich_table(tables.views_table(by_view, opened.label)))
     return 0

@@ -22,6 +22,7 @@ from rgbt.metrics.named import value
 from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.runs.run_spec import settings_digest
 from tests.commands import Call, Trained, edit_config, short
+from tests.measured import measurement
 
 ONE = ("+experiment=crm", *short(1))
 """A run that several test files read."""
@@ -37,8 +38,9 @@ def run(trained: Trained) -> rgbt.Run:
 
 def some_counts(seed: int, split: str = "test") -> Counts:
     matrix = np.random.default_rng(seed).integers(0, 9, (2, 3, 2, 2))
-    data: Any = {"dataset": "f00d", "split": split, "names": ("a", "b"), "night": (False, True)}
-    return Counts(counts=matrix, classes=("road", "car"), partition="ring3", **data)
+    of = measurement(dataset="f00d", split=split, partition="ring3")
+    data: Any = {"measurement": of, "names": ("a", "b"), "night": (False, True)}
+    return Counts(counts=matrix, classes=("road", "car"), **data)
 
 
 def write_run(path: Path, group: str, seed: int, *, finished: bool = True) -> RunFolder:

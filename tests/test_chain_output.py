@@ -55,7 +55,7 @@ def test_day_night_run_shows_mean_and_other_head(call: Call, tmp_path: Path) -> 
     other = miou(out, night=True)
     assert other != pytest.approx(night)
     assert value_of("source head, night", printed) == pytest.approx(other, abs=0.01)
-    stored = Counts.load(folder / "counts_test_source_head.npz")
+    stored = Counts.load(folder / "evaluations" / "test_source-head.npz")
     assert np.array_equal(stored.counts, Counts.load(out).counts)
     result = json.loads((folder / "result.json").read_text())
     assert 100 * result["test"]["source_head/night/mIoU"] == pytest.approx(other)

@@ -26,7 +26,7 @@ from tests.commands import SPLITS, Call, Trained, logged, only_run, short, train
 from tests.conftest import pair, write_png
 
 TEMPORAL = ("+experiment=temporal_con", "masker.patch_size=null", *short(2))
-ALIGNED, RELEASED = "consistency_aligned_test.npz", "consistency_released_test.npz"
+ALIGNED, RELEASED = "test_aligned3.npz", "test_released3.npz"
 SCORES = ("TC/aligned", "CA/aligned", "TC/released", "CA/released")
 SYNTH = (
     *("dataset=synth", "dataset.num_train=1", "dataset.num_val=2", "dataset.num_test=3"),
@@ -119,7 +119,8 @@ def test_image_of_another_shape_does_not_end_the_training(
     result = read(folder, "result.json")
     assert not set(SCORES) & set(result["test"])
     assert set(SCORES) <= set(result["val"])
-    assert not [*folder.rglob("consistency_*_test.npz")]
+    assert [path.name for path in folder.rglob("test_*.npz")] == []
+    assert (folder / "evaluations" / "val_aligned3.npz").is_file()
 
 
 def test_consistency_of_a_finished_run_equals_its_own(
@@ -169,19 +170,27 @@ def test_consistency_with_other_views_replaces_nothing(
 def test_consistency_on_another_motion_replaces_no_counts(
     call: Call, plain: Path, tmp_path: Path
 ) -> None:
-    path = plain / "evaluations" / "consistency_next_test.npz"
+    place = plain / "evaluations"
     where = (f"run={plain}", "frames=next", *SYNTH, f"dataset.cache_dir={tmp_path / 'cache'}")
     refused(call, "", *where)  # without second frames
-    assert not path.exists()
+    assert not place.exists()
     assert "TC next" in measure(call, *where, "dataset.ego_forward_m=0.5")
+    (path,) = place.glob("*.npz")
     counts, before = Counts.load(path), path.read_bytes()
+    assert re.fullmatch(r"test_next1-[0-9a-f]{6}_synth-[0-9a-f]{8}\.npz", path.name)
     assert re.fullmatch("next1-[0-9a-f]{6}", counts.partition)
     assert counts.counts.shape == (3, 10, 9, 9)
     assert 0.5 * 3 * 48 * 64 < counts.counts.sum() < 3 * 48 * 64  # what both frames show
-    refused(call, str(path), *where, "dataset.ego_forward_m=0.7")
+    measure(call, *where, "dataset.ego_forward_m=0.7")
     assert path.read_bytes() == before
-    measure(call, *where, "dataset.ego_forward_m=0.7", f"out={tmp_path / 'out'}")
-    assert Counts.load(tmp_path / "out" / path.name).partition != counts.partition
+    (beside,) = {*place.glob("*.npz")} - {path}
+    other = Counts.load(beside)
+    assert other.partition != counts.partition
+    assert not np.array_equal(other.counts, counts.counts)
+    # Where the other counts have that name, they are not replaced either.
+    shutil.copy(beside, path)
+    refused(call, f"{path} holds another measurement", *where, "dataset.ego_forward_m=0.5")
+    assert path.read_bytes() == beside.read_bytes()
 
 
 @pytest.fixture
@@ -270,7 +279,7 @@ def measure_video(call: Call, drive: Path, folder: Path, *more: str) -> dict[str
     out = folder.parent / f"{folder.name}_out"
     given = (f"predictions={folder}", *of_video(drive), f"out={out}", *more)
     assert "Flow of 3 pairs" in measure(call, *given)
-    paths = {name: out / f"consistency_{name}_test.npz" for name in ("flow", "triples")}
+    paths = {name: out / f"test_{name}1.npz" for name in ("flow", "triples")}
     return {name: Counts.load(path) for name, path in paths.items()}
 
 
@@ -288,12 +297,12 @@ def test_predictions_that_follow_the_motion_are_consistent(
     labelled = found["flow"].counts[:, :3].sum((1, 2, 3))
     assert labelled.tolist() == [0, found["flow"].counts[1].sum(), 0]
     assert labelled[1] > 0.6 * HW[0] * HW[1]
-    records = list(csv.DictReader((tmp_path / "right_out" / "flow_test.csv").open()))
+    records = list(csv.DictReader((tmp_path / "right_out" / "test_flow1.csv").open()))
     assert [record["name"] for record in records] == ["2", "3", "4"]
     for record in records:
         assert float(record["displacement_px"]) == pytest.approx(STEP, abs=0.3)
         assert 0.6 < float(record["used"]) < 1 - STEP / HW[1] + 0.02
-    assert (tmp_path / "right_out" / "pairs_flow_test.png").is_file()
+    assert (tmp_path / "right_out" / "pairs_test_flow1.png").is_file()
 
 
 def test_a_frame_that_is_wrong_alone_flickers(call: Call, drive: Path, tmp_path: Path) -> None:
@@ -306,5 +315,5 @@ def test_a_frame_that_is_wrong_alone_flickers(call: Call, drive: Path, tmp_path:
     assert value("flicker", found["triples"].select(["4"]), "released") < 1.5
     # Another source of the flow has files of its own.
     measure_video(call, drive, tmp_path / "wrong", "flow=thermal")
-    (path,) = (tmp_path / "wrong_out").glob("consistency_flow-*_test.npz")
-    assert Counts.load(path).partition == path.stem[12:-5].replace("flow", "flow1")
+    (path,) = (tmp_path / "wrong_out").glob("test_flow1-*.npz")
+    assert path.stem == f"test_{Counts.load(path).partition}"

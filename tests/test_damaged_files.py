@@ -9,19 +9,19 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
 import pytest
 
-from analysis.results import level_of
 from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import read_settings
 from rgbt.data.files import decode, read_names
 from rgbt.data.labels import indices
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabels
 from rgbt.files.plain_files import write_json
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, read_measurement
 from rgbt.runs.folder import (
     Description,
     RunFolder,
@@ -33,12 +33,23 @@ from rgbt.runs.folder import (
 )
 from rgbt.tables import ClassTable, RegionTable, ResultTables
 from tests.damage import damaged
+from tests.measured import measurement
 
 HEADROOM = 2**30
 """Bytes that reading a small damaged file may ask for at most."""
 
 RNG = np.random.default_rng(0)
 CLASSES = ("background", "car", "person", "bike", "curve")
+
+MEASUREMENT = measurement(
+    partition="ring3",
+    dataset="0123456789abcdef",
+    severity=0.5,
+    settings=(("corruption.seed", "1"), ("transform.test_short_edge", "48")),
+    changed=("severity",),
+    corruption="noise",
+    title="Noise",
+)
 
 
 def counts(path: Path) -> None:
@@ -47,9 +58,7 @@ def counts(path: Path) -> None:
         names=tuple("abcd"),
         night=(True, False, True, False),
         classes=CLASSES,
-        partition="ring3",
-        dataset="0123456789abcdef",
-        split="test",
+        measurement=MEASUREMENT,
         unscored=("curve",),
     ).save(path)
 
@@ -123,16 +132,6 @@ def read_pseudo(path: Path) -> Any:
     return labels.classes, labels.digest, *labels.read("a")
 
 
-def robustness(path: Path) -> None:
-    counts(path.with_suffix(".npz"))
-    write_json(path, {"row": "noise", "title": "Noise", "unit": "", "severity": 0.5})
-
-
-def read_robustness(path: Path) -> Any:
-    level = level_of(path.with_suffix(".npz"))
-    return level.row, level.title, level.unit, level.severity
-
-
 def names(path: Path) -> None:
     path.write_text("".join(f"{n:05d}D\n" for n in range(100)))
 
@@ -140,6 +139,7 @@ def names(path: Path) -> None:
 KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     # file: what writes it, what reads it
     "counts_test.npz": (counts, Counts.load),
+    "measurement.npz": (counts, read_measurement),
     "rgbt.png": (image(4), decode),
     "16_bits.png": (image(1, "uint16"), decode),
     "rgb.jpg": (image(3), decode),
@@ -155,7 +155,6 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "labels/a.png": (pseudo, read_pseudo),
     "confidence/a.png": (pseudo, read_pseudo),
     "train.txt": (names, lambda path: read_names(path, "dataset.splits")),
-    "noise.json": (robustness, read_robustness),
 }
 UNSEALED = {"rgb.jpg", "train.txt"}
 """Files without checksums: values may be others of the same form."""
@@ -214,6 +213,15 @@ def test_damaged_files_are_refused_or_read_right(name: str, tmp_path: Path) -> N
     assert set(wrong) <= {"fits", "refused"}, wrong
 
 
+def bytes_read(path: Path) -> tuple[int, int]:
+    """The first and the last byte of what is read of a file."""
+    if path.name != "measurement.npz":
+        return 0, path.stat().st_size - 1
+    with ZipFile(path) as archive:
+        member = archive.getinfo("measurement.npy")
+    return member.header_offset, member.header_offset + member.compress_size
+
+
 @pytest.mark.parametrize("name", OWN)
 def test_one_changed_byte_of_an_own_file_never_gives_another_value(
     name: str, tmp_path: Path
@@ -223,7 +231,7 @@ def test_one_changed_byte_of_an_own_file_never_gives_another_value(
     make(path)
     content, expected = path.read_bytes(), plain(read(path))
     wrong, refused = [], 0
-    for place in np.linspace(0, len(content) - 1, 200).astype(int):
+    for place in np.linspace(*bytes_read(path), 200).astype(int):
         for byte in {content[place] ^ 1, content[place] ^ 32, ord("\n"), ord("?")}:
             path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
             try:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from rgbt.config.corruption_node import choose_corruption
 from rgbt.data.cache import CachedDataset
 from rgbt.data.mfnet import CLASSES, MFNet
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabelled, Unlabelled
 from rgbt.dataset import DatasetWrapper, reader_of
-from rgbt.evaluation.request import CorruptedDataset, choose_corruption
+from rgbt.evaluation.corruption import CorruptedDataset
 from rgbt.files.plain_files import write_json
 
 NAMES = ("00001D", "00002N")
@@ -29,9 +30,7 @@ WRAPPERS: dict[str, Callable[[MFNet, Path], DatasetWrapper]] = {
     "cached": lambda source, folder: CachedDataset(source, str(folder / "cache")),
     "pseudo-labelled": pseudo,
     "unlabelled": lambda source, folder: Unlabelled(source),
-    "corrupted": lambda source, _: CorruptedDataset(
-        source, choose_corruption("noise").at("8"), "train"
-    ),
+    "corrupted": lambda source, _: CorruptedDataset(source, choose_corruption("noise"), 8, "train"),
 }
 
 

@@ -6,12 +6,11 @@ import csv
 import shutil
 from pathlib import Path
 
-import numpy as np
-
 from analysis import details
 from rgbt import evaluate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from rgbt.runs.result import RunResult
 from tests.commands import Call, Trained, assert_one_sentence, short
 
 
@@ -25,27 +24,32 @@ def test_details_of_every_input_are_stored_and_shown_again(
     assert code == 2
     assert_one_sentence(err, "modality=all details=boundary")
 
+    before = (folder / "counts_test.npz").read_bytes()
     words = (f"run={folder}", "modality=all", "details=[boundary,calibration]")
     code, out, err = call(evaluate.entry, *words)
     assert code == 0, err
-    stem = folder / "evaluations" / "mfnet_test"
-    for view in ("rgbt", "rgb", "thermal"):
-        for kind, partition in (
-            ("", "ring5"),
-            ("-boundary", "ring5-boundary-0.02"),
-            ("-calibration", "ring5-calibration-15"),
-        ):
-            assert Counts.load(Path(f"{stem}_{view}_ring5{kind}.npz")).partition == partition
+    stored = {
+        (path, of.view, of.partition) for path, of in RunResult(folder).measurements().items()
+    }
+    expected = {("counts_test.npz", "rgbt", "ring5"), ("counts_val.npz", "rgbt", "ring5")}
+    expected |= {(f"evaluations/test_{view}.npz", view, "ring5") for view in ("rgb", "thermal")}
+    for view, begin in (("rgbt", ""), ("rgb", "rgb_"), ("thermal", "thermal_")):
+        for partition in ("ring5-boundary-0.02", "ring5-calibration-15"):
+            expected.add((f"evaluations/test_{begin}{partition}.npz", view, partition))
+    assert stored == expected
     assert "mIoU in percent by region and input" in out
-    plain = Counts.load(Path(f"{stem}_rgbt_ring5.npz"))
-    assert np.array_equal(plain.counts, Counts.load(folder / "counts_test.npz").counts)
+    assert "counts_test.npz (measured before)" not in " ".join(out.split()), "for its details"
+    assert (folder / "counts_test.npz").read_bytes() == before
+    code, out, err = call(evaluate.entry, *words)
+    assert code == 0, err
+    assert out.count("(measured before)") == 3
 
     code, out, err = call(details.entry, f"run={folder}", f"out={tmp_path / 'shown'}")
     assert code == 0, err
     assert "mIoU in percent by region and input (ring5)" in out
     lines = list(csv.DictReader((tmp_path / "shown" / "details.csv").open()))
     found = {(row["details"], row["input"], row["metric"]): row for row in lines}
-    boundary = Counts.load(Path(f"{stem}_thermal_ring5-boundary.npz"))
+    boundary = Counts.load(folder / "evaluations" / "test_thermal_ring5-boundary-0.02.npz")
     row = found["boundary", "thermal", "boundary_mIoU"]
     assert float(row["value"]) == value("boundary_mIoU", boundary, "released")
     assert (row["low"], row["high"]) == ("", "")  # 3 images have no interval

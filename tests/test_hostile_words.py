@@ -30,6 +30,7 @@ from sweeps.table.request import REQUESTED, TAG
 from sweeps.verdicts import stored
 from sweeps.worker import storage
 from tests.commands import Call, Trained, short
+from tests.measured import remeasured
 
 TABLE, LABEL, SECRET = "crm/table3a", "CRM", "s3cr3t"
 SHELL = "posix.system"
@@ -108,7 +109,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, trained: Trained) -> Path:
         RunFolder(folder).describe(described)
         for file in folder.rglob("*.npz"):
             counts = Counts.load(file)
-            replace(counts, run=key if counts.run else "").save(file)
+            remeasured(counts, run=key if counts.measurement.run else "").save(file)
         write_json(folder / "result.json", {**result, "key": key})
         config = (folder / "config.yaml").read_text()
         old, new = SETTINGS.get(word, ("", ""))

@@ -11,12 +11,13 @@ import pytest
 
 from rgbt import evaluate, robustness
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.scores import summary
 from tests.commands import Call, Trained, short
 
 ENTRY = robustness.entry
 EVALUATE = evaluate.entry
 NOISE = ("corruptions=noise:rgb", "corruption.severities=[16,64]")
-MARKS = ("clean", "features-rgb", "features-thermal", "noise_rgb-16", "noise_rgb-64")
+MARKS = ("test_rgb", "test_thermal", "test_noise_rgb-16", "test_noise_rgb-64")
 
 
 @pytest.mark.slow
@@ -27,32 +28,39 @@ def test_robustness_counts_are_those_of_evaluate(
     folder = Path(shutil.copytree(done, tmp_path / "runs" / done.name))
     code, out, err = call(ENTRY, f"run={folder}", *NOISE)
     assert code == 0, err
-    place = folder / "evaluations" / "robustness" / "test"
+    place = folder / "evaluations"
     assert f"counts  {place}/" in out
     assert {path.name for path in place.iterdir()} == {
-        *("robustness_noise_rgb.md", "robustness_noise_rgb.csv"),
-        *(f"{mark}.{end}" for mark in MARKS for end in ("npz", "json")),
+        *("robustness_test_noise_rgb.md", "robustness_test_noise_rgb.csv"),
+        *(f"{mark}.npz" for mark in MARKS),
     }
     counts = {path.stem: Counts.load(path).counts for path in place.glob("*.npz")}
-    np.testing.assert_array_equal(counts["clean"], Counts.load(folder / "counts_test.npz").counts)
-    with (place / "robustness_noise_rgb.csv").open() as file:
+    clean = Counts.load(folder / "counts_test.npz")
+    with (place / "robustness_test_noise_rgb.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert [line["severity"] for line in lines] == ["0", "1", "1", "16", "64"]
+    assert [line["severity"] for line in lines] == ["0", "0", "0", "16", "64"]
+    # Clean images are those that the run ended with.
+    assert float(lines[0]["mIoU"]) == pytest.approx(100 * summary(clean, clean.absent)["mIoU"])
     # The same by the other command.
     words_of = {
-        "noise_rgb-64": ("corruption=noise:rgb", "severity=64"),
-        "features-thermal": ("modality=thermal",),
+        "test_noise_rgb-64": ("corruption=noise:rgb", "severity=64"),
+        "test_thermal": ("modality=thermal",),
     }
     for mark, words in words_of.items():
         file = tmp_path / f"{mark}.npz"
         assert call(EVALUATE, f"run={folder}", f"out={file}", *words)[0] == 0
         np.testing.assert_array_equal(counts[mark], Counts.load(file).counts)
     words = ("corruption=noise", "corruption.image=rgb", "severity=16")
-    assert call(EVALUATE, f"run={folder}", *words)[0] == 0
-    assert (folder / "evaluations" / "mfnet_test_rgbt_ring5_noise_rgb-16.npz").exists()
+    before = {path: path.read_bytes() for path in place.iterdir()}
+    code, out, err = call(EVALUATE, f"run={folder}", *words)
+    assert code == 0, err
+    assert "test_noise_rgb-16.npz (measured before)" in " ".join(out.split())
+    assert {path: path.read_bytes() for path in place.iterdir()} == before
     # Over other regions beside them; twice the same run, of which nothing is made again.
     words = ("corruptions=removed:thermal", "regions=ring9", "runs_dir=" + str(tmp_path / "runs"))
     code, out, err = call(ENTRY, f"run={folder.name},{folder.name}", *words)
     assert code == 0, err
     assert out.count("thermal removed (zeroed)") == 2
-    assert (place.with_name("test_ring9") / "thermal_removed-1.npz").exists()
+    assert (place / "test_ring9_thermal_removed.npz").exists()
+    assert (place / "robustness_test_ring9_thermal_removed.csv").exists()
+    assert {path: path.read_bytes() for path in before} == before

@@ -211,7 +211,7 @@ def test_unreadable_files_are_skipped_on_request(call: Call, data: Path, tmp_pat
     assert code == 0, err
     folder = only_run(tmp_path / "runs")
     assert sorted(json.loads((folder / "result.json").read_text())["skipped"]) == sorted(spoiled)
-    counts = Counts.load(folder / "evaluations" / "consistency_aligned_test.npz")
+    counts = Counts.load(folder / "evaluations" / "test_aligned3.npz")
     assert counts.names == tuple(SPLITS["test"][1:])
 
 
@@ -249,19 +249,25 @@ def test_evaluate_and_predict_a_finished_run(
     payload["model"] = {key: torch.zeros_like(each) for key, each in payload["model"].items()}
     save(folder / "last.pt", payload)
     requests = {
-        "rgbt_ring5": (f"run={folder}",),
+        f"out={tmp_path / 'again.npz'}": (f"run={folder}",),
         "rgb_ring9": (f"run={folder.name}", f"runs_dir={runs}", "modality=rgb", "regions=ring9"),
-        "rgbt_ring5_last": (f"run={folder}", "checkpoint=last"),
+        "last-1": (f"run={folder}", "checkpoint=last"),
     }
-    found = {}
     for name, words in requests.items():
-        code, _, err = call(evaluate.entry, *words)
+        code, _, err = call(evaluate.entry, *words, *([name] if name.startswith("out=") else []))
         assert code == 0, err
-        found[name] = Counts.load(folder / "evaluations" / f"mfnet_test_{name}.npz").counts
-    stored = Counts.load(folder / "counts_test.npz").counts
-    assert np.array_equal(found["rgbt_ring5"], stored)
+    stored, again = (
+        Counts.load(each / name)
+        for each, name in ((folder, "counts_test.npz"), (tmp_path, "again.npz"))
+    )
+    assert np.array_equal(again.counts, stored.counts)
+    assert again.measurement == stored.measurement
+    of_rings, last = (
+        Counts.load(folder / "evaluations" / f"test_{name}.npz") for name in ("rgb_ring9", "last-1")
+    )
+    assert (of_rings.partition, of_rings.measurement.view) == ("ring9", "rgb")
     # Without weights it predicts one class.
-    assert np.count_nonzero(found["rgbt_ring5_last"].sum((0, 1, 2))) == 1
+    assert np.count_nonzero(last.counts.sum((0, 1, 2))) == 1
 
     image = tmp_path / "images" / "a.png"
     image.parent.mkdir()
@@ -288,6 +294,7 @@ NIGHT = ("+experiment=multi_head_night", *DAYS_AND_NIGHTS, *short(2))
 def evaluated(call: Call, folder: Path, *words: str) -> Counts:
     """Counts of `rgbt.evaluate` of a run folder."""
     out = folder.parent / "evaluated.npz"
+    out.unlink(missing_ok=True)
     code, _, err = call(evaluate.entry, f"run={folder}", f"out={out}", *words)
     assert code == 0, err
     return Counts.load(out)
@@ -326,7 +333,7 @@ def test_statistics_of_each_domain_change_only_the_counts(trained: Trained, call
     code, out, err = call(evaluate.entry, f"run={folder}", "batch_norm=adabn")
     assert code == 0, err
     assert "AdaBN" in out
-    found = Counts.load(folder / "evaluations" / "synth_freiburg_test_rgb_ring5_norm-adabn.npz")
+    found = Counts.load(folder / "evaluations" / "test_adabn.npz")
     stored = Counts.load(folder / "counts_test.npz")
     assert (found.names, found.night) == (stored.names, stored.night)
     assert not np.array_equal(found.counts, stored.counts)

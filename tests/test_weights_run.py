@@ -55,7 +55,7 @@ def test_weights_are_scored_without_a_run(
     code, out, err = call(EVALUATE, *named)
     assert code == 0, err
     assert "mIoU" in out
-    (written,) = tmp_path.glob("evaluations/*/mfnet_test_rgbt_ring5.npz")
+    (written,) = tmp_path.glob("evaluations/*/test_ring5_*.npz")
     stored = Counts.load(folder / "counts_test.npz")
     assert np.array_equal(Counts.load(written).counts, stored.counts)
 
@@ -108,7 +108,8 @@ def test_a_network_of_one_image_is_scored_from_it(call: Call, data: Path, tmp_pa
     folder = only_run(tmp_path)
     code, _, err = call(EVALUATE, f"run={folder}")
     assert code == 0, err
-    assert (folder / "evaluations" / "mfnet_test_rgb_ring5.npz").exists()
+    assert Counts.load(folder / "counts_test.npz").measurement.view == "rgb"
+    assert not (folder / "evaluations").exists(), "it was measured before"
     code, _, err = call(EVALUATE, f"run={folder}", "modality=thermal")
     assert code == 2
     assert_one_sentence(err, "modality")

@@ -9,7 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rgbt.assembly.session import Session, measured_settings, names_key, open_session
+from rgbt.assembly.session import (
+    Session,
+    measured_settings,
+    names_key,
+    open_session,
+    reader_settings,
+)
 from rgbt.checks import InputError, check_choice
 from rgbt.config.common_options import AS_TRAINED, NetworkOptions
 from rgbt.config.compose import compose
@@ -199,7 +205,10 @@ def _changed(
 ) -> tuple[str, ...]:
     """See `Session.changed`; `fingerprint` of the data set that the network was trained on."""
     before, now = measured_settings(trained_with), measured_settings(session.spec.plain)
-    changed = [key for key in sorted(now) if key not in before or before[key] != now[key]]
+    read = [key.removeprefix("dataset.") for key in reader_settings(session.dataset)]
+    for values, plain in ((before, trained_with), (now, session.spec.plain)):
+        values |= {f"dataset.{key}": plain["dataset"].get(key) for key in read}
+    changed = [key for key in sorted(now) if before.get(key) != now[key]]
     nodes = (dict(plain["metric"]) for plain in (trained_with, session.spec.plain))
     first, second = ({key: node[key] for key in node.keys() - {"absent"}} for node in nodes)
     changed += ["partition"] if first != second else []
@@ -210,7 +219,8 @@ def _changed(
 def _typed(session: Session, overrides: Sequence[str]) -> tuple[str, ...]:
     """The settings of a network that is no run which were typed; see `Session.changed`."""
     words = [word.lstrip("+").partition("=")[0] for word in overrides]
-    known = sorted(measured_settings(session.spec.plain))
+    read = reader_settings(session.dataset)
+    known = sorted(measured_settings(session.spec.plain) | read)
     changed = [key for key in known if any(f"{key}.".startswith(f"{word}.") for word in words)]
     is_cut = any(word.split(".")[0] == "metric" for word in words)
     return (*changed, *(["partition"] if is_cut else []))

@@ -215,9 +215,19 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
 
 def measured_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a plain configuration that decide how images are predicted, by dotted key."""
-    precision = {"precision": plain["trainer"]["precision"]}
-    nodes = {"transform": plain["transform"], "prediction": plain["prediction"]}
-    return flatten({**nodes, "trainer": precision})
+    nodes = {key: plain[key] for key in ("transform", "prediction")}
+    nodes["trainer"] = {"precision": plain["trainer"]["precision"]}
+    nodes["data"] = {"eval_batch_size": plain["data"]["eval_batch_size"]}
+    return flatten(nodes)
+
+
+def reader_settings(dataset: LabelledDataset) -> dict[str, Any]:
+    """The settings of a data set that change the pixels of its files, by dotted key."""
+    found = {f"dataset.{key}": value for key, value in dataset.decoding().items()}
+    found.pop("dataset.layouts", None)  # which files these are, says the fingerprint
+    if "dataset.codes" in found:  # numbers in label files, a setting of this name
+        found["dataset.ids"] = found.pop("dataset.codes")
+    return found
 
 
 def names_key(session: Session) -> str:

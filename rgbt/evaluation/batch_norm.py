@@ -123,14 +123,18 @@ def normalised(
             if kind != "batch":
                 skipped = _pass(session, predictor, sources)
                 hooks.close()
-                if not any(each.count for each in moments):
-                    raise InputError(f"batch_norm={kind}: no image could be read.")
-                for each in moments:
-                    each.finish()
+                _finish(moments, kind)
             yield skipped
     finally:
         for norm, before in zip(norms, stored, strict=True):
             norm.load_state_dict(before)
+
+
+def _finish(moments: Sequence[BatchMoments], kind: str) -> None:
+    if not any(each.count for each in moments):
+        raise InputError(f"batch_norm={kind}: no image could be read.")
+    for each in moments:
+        each.finish()
 
 
 def _pass(session: Session, predictor: Predictor, names: Names) -> Names:

@@ -10,11 +10,13 @@ from textwrap import shorten
 import numpy as np
 
 from rgbt.assembly.session import Session
+from rgbt.checks import InputError
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.measure import check_replaceable, legend_of
 from rgbt.evaluation.pair_frames import FlowRecord
 from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
 from rgbt.files.atomic import write_atomic
+from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol
 from rgbt.runs.folder import RunFolder, read_result, read_tables
 from rgbt.tables import ConsistencyTable, csv_text, without_nan
@@ -30,6 +32,7 @@ def write_pairs(
     """
     for protocol, counts in pairs.counts.items():
         check_replaceable(paths[protocol], counts.measurement)
+        _check_same_predictions(paths[protocol], counts)
     for protocol, counts in pairs.counts.items():
         paths[protocol].parent.mkdir(parents=True, exist_ok=True)
         counts.save(paths[protocol])
@@ -47,6 +50,15 @@ def write_pairs(
         draw_pairs(pairs.kept, legend_of(dataset), picture)
         lines.append(("picture", str(picture)))
     return lines
+
+
+def _check_same_predictions(path: Path, counts: Counts) -> None:
+    """InputError: the file holds counts of other predictions, of which no network is known."""
+    of = counts.measurement
+    if of.run or of.weights or not path.exists():
+        return
+    if not np.array_equal(Counts.load(path).counts, counts.counts):
+        raise InputError(f"{path} holds counts of other predictions; remove it, or set out=...")
 
 
 def add_to_result(run: RunFolder, session: Session, split: str, table: ConsistencyTable) -> None:

@@ -5,7 +5,8 @@ Details are counted in the same pass: boundaries, calibration, distance and size
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rgbt.assembly.session import Session, measured_settings
+from rgbt.assembly.session import Session, measured_settings, reader_settings
 from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import AS_TRAINED
 from rgbt.data.domains import TestedHead
@@ -61,7 +62,7 @@ class Counted(NamedTuple):
     counts: dict[str, Matrix]
     details: dict[str, dict[DetailKind, Matrix]]
     kept: list[PanelExample]
-    skipped: tuple[str, ...]
+    skipped: list[str]
 
 
 def measurement_of(
@@ -85,11 +86,13 @@ def measurement_of(
     values, dataset = measured_settings(session.spec.plain), session.dataset
     changed = ["view"] if view_of(session, view) != view_of(session) else []
     changed += ["head"] if (head or tested) != tested else []
+    values |= reader_settings(dataset)
     changed += [*session.changed, *(["checkpoint"] if session.checkpoint != "best" else [])]
-    changed += ["statistics"] if batch_norm != AS_TRAINED else []
-    if batch_norm == "batch":
-        values["data.eval_batch_size"] = session.loading.eval_batch_size
-        changed.append("data.eval_batch_size")
+    if batch_norm != AS_TRAINED:
+        changed += ["statistics"]
+    else:  # the size of a batch changes nothing
+        del values["data.eval_batch_size"]
+        changed = [key for key in changed if key != "data.eval_batch_size"]
     corruption: dict[str, Any] = {}
     if isinstance(dataset, CorruptedDataset) and dataset.severity:
         chosen, kind = dataset.chosen, dataset.corruption
@@ -154,39 +157,29 @@ def measure(
     predictor = check(session, wanted)
     counters = _detail_counters(session, details)
     regions = RegionCounter(len(session.dataset.classes), session.regions)
-    parts, unmeasured = list[Counted](), list[str]()
+    found = Counted({}, {}, [], [])
     images = session.loading.eval_batch_size
     advice = "Predict windows with prediction.window_hw=[...], or use trainer.accelerator=cpu."
     if images > 1:
         advice = "Set data.eval_batch_size=1, with equal results."
-    with naming_memory(session.device, f"an evaluation of {images} images at once", advice):
-        for names, sources in parts_of_split(session.dataset, wanted):
-            found = Counted({}, {}, [], ())
-            images_of_part = Subset(session.dataset, names)
-            with normalised(session, predictor, wanted, sources) as skipped:
-                unmeasured += skipped
-                batches = eval_batches(
-                    images_of_part, wanted.split, session.transform, session.loading
-                )
-                for loaded in shown(batches, wanted.split, len(names)):
-                    batch = predictor.counted(loaded)
-                    on_device = batch.to(session.device)
-                    if "calibration" in counters:
-                        classes, confidence = predictor.confident_classes(on_device)
-                        sure: Sequence[Tensor | None] = list(confidence.cpu())
-                    else:
-                        classes, sure = predictor.classes(on_device), [None] * len(batch.name)
-                    images_of = zip(batch.name, batch.label, classes.cpu(), sure, strict=True)
-                    for name, label, predicted, each in images_of:
-                        found.counts[name] = regions(label, predicted)
-                        maps = (label, predicted, each)
-                        found.details[name] = _details_of(counters, session.dataset, name, maps)
-                        if name in keep:
-                            found.kept.append(_example(session, name, predicted.numpy()))
-            parts.append(found._replace(skipped=tuple(batches.skipped)))
-    every = joined(
-        [each for part in parts for each in collected(part)], session.dataset.names(wanted.split)
-    )
+    memory = naming_memory(session.device, f"an evaluation of {images} images at once", advice)
+    with memory, closing(_batches(session, predictor, wanted, found.skipped)) as batches:
+        for loaded in batches:
+            batch = predictor.counted(loaded)
+            on_device = batch.to(session.device)
+            if "calibration" in counters:
+                classes, confidence = predictor.confident_classes(on_device)
+                sure: Sequence[Tensor | None] = list(confidence.cpu())
+            else:
+                classes, sure = predictor.classes(on_device), [None] * len(batch.name)
+            images_of = zip(batch.name, batch.label, classes.cpu(), sure, strict=True)
+            for name, label, predicted, each in images_of:
+                found.counts[name] = regions(label, predicted)
+                maps = (label, predicted, each)
+                found.details[name] = _details_of(counters, session.dataset, name, maps)
+                kept = [name] if name in keep else []
+                found.kept.extend(_example(session, each, predicted.numpy()) for each in kept)
+    every = joined(collected(found), session.dataset.names(wanted.split))
     by_kind = {}
     for kind_of in details:
         kind = kind_of.kind
@@ -199,8 +192,23 @@ def measure(
         counts=counts_of(session.dataset, wanted, every.counts),
         details=by_kind,
         kept=tuple(every.kept),
-        skipped=tuple(dict.fromkeys((*every.skipped, *unmeasured))),
+        skipped=tuple(every.skipped),
     )
+
+
+def _batches(
+    session: Session, predictor: Predictor, wanted: Measurement, skipped: list[str]
+) -> Generator[Batch, None, None]:
+    """The batches of a split; while one is used, the network has the wanted statistics.
+
+    Names of unreadable images, also of the statistics, are added to `skipped`.
+    """
+    for names, sources in parts_of_split(session.dataset, wanted):
+        images = Subset(session.dataset, names)
+        with normalised(session, predictor, wanted, sources) as unmeasured:
+            batches = eval_batches(images, wanted.split, session.transform, session.loading)
+            yield from shown(batches, wanted.split, len(names))
+        skipped += (*batches.skipped, *unmeasured)
 
 
 def shown(batches: Any, what: str, total: int) -> Iterator[Batch]:
@@ -240,45 +248,44 @@ def path_of(session: Session, wanted: Measurement) -> Path:
     return (session.folder if is_beside else session.folder / EVALUATIONS) / wanted.file_name
 
 
-class Stored(NamedTuple):
-    """Counts by file: of single frames, then of details; `is_new`: just measured."""
-
-    files: dict[Path, Counts]
-    skipped: int = 0
-    is_new: bool = True
-
-
-def stored_or_measured(
+def files_of(
     session: Session, wanted: Measurement, details: Sequence[Details] = (), out: Path | None = None
-) -> Stored:
-    """The counts of a measurement and of its details from their files, or measured and stored.
-
-    Args:
-        session: as of `measure`.
-        wanted: the measurement.
-        details: what else to count.
-        out: file of the counts, those of details beside it; None: `path_of`.
-
-    Raises:
-        InputError: as `measure`; a file holds another measurement, which is never replaced.
-    """
-    every = {out or path_of(session, wanted): wanted}
+) -> dict[Path, Measurement]:
+    """The file of a measurement, then those of its details; `out`: instead of `path_of`."""
+    found = {out or path_of(session, wanted): wanted}
     for each in details:
         detailed = of_partition(wanted, each.partition(session.regions.name))
         beside = out and out.with_name(f"{out.stem}-{each.kind}{out.suffix}")
-        every[beside or path_of(session, detailed)] = detailed
-    images = len(set(session.dataset.names(wanted.split)))
-    found = {path: _stored(path, each, images) for path, each in every.items()}
-    before = {path: counts for path, counts in found.items() if counts is not None}
-    if len(before) == len(every):
-        return Stored(before, is_new=False)
-    made = measure(session, wanted, details)
-    for path, counts in zip(every, (made.counts, *made.details.values()), strict=True):
-        if path not in before:  # equal counts of another machine may differ in single pixels
+        found[beside or path_of(session, detailed)] = detailed
+    return found
+
+
+def stored(session: Session, files: Mapping[Path, Measurement]) -> dict[Path, Counts]:
+    """The counts that their files hold already, with the scored classes of `session`.
+
+    InputError: a file holds another measurement, which is never replaced.
+    """
+    found = {}
+    for path, wanted in files.items():
+        images = len(set(session.dataset.names(wanted.split)))
+        if (counts := _stored(path, wanted, images)) is not None:
+            # How they are scored is no part of a measurement.
+            unscored = session.dataset.unscored
+            found[path] = replace(counts, measurement=wanted, unscored=unscored)
+    return found
+
+
+def store(
+    files: Iterable[Path], made: Measured, before: Mapping[Path, Counts]
+) -> dict[Path, Counts]:
+    """Write what was measured; files of `before` stay, as another machine may have made them."""
+    found = {}
+    for path, counts in zip(files, (made.counts, *made.details.values()), strict=True):
+        found[path] = before.get(path, counts)
+        if path not in before:
             path.parent.mkdir(parents=True, exist_ok=True)
             counts.save(path)
-            before[path] = counts
-    return Stored({path: before[path] for path in every}, len(made.skipped))
+    return found
 
 
 def _stored(path: Path, wanted: Measurement, images: int) -> Counts | None:
@@ -295,7 +302,12 @@ def check_replaceable(path: Path, wanted: Measurement) -> bool:
 
     InputError: it holds another one, which is not replaced.
     """
-    differing = wanted.differences(read_measurement(path)) if path.exists() else ("step",)
+    if not path.exists():
+        return False
+    try:
+        differing = wanted.differences(read_measurement(path))
+    except InputError as error:
+        raise InputError(f"{error} Remove the file to replace it.") from error
     if not set(differing) <= {"step"}:
         raise InputError(
             f"{path} holds another measurement ({', '.join(differing)}); remove it, or name "
@@ -343,7 +355,7 @@ def joined(parts: Sequence[Counted], names: Sequence[str]) -> Counted:
         {name: counts[name] for name in names if name in counts},
         {name: details[name] for name in names if name in details},
         sorted(kept, key=lambda example: position[example.name]),
-        tuple(sorted(skipped, key=position.__getitem__)),
+        sorted(dict.fromkeys(skipped), key=lambda name: position.get(name, len(position))),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -49,16 +49,16 @@ class Predictor:
     def classes(self, batch: Batch) -> Tensor:
         """(B, H', W') uint8: class of every pixel of the labels of a batch on the device."""
         if self._settings.enlarged == "scores":
-            return classes_of(self.scores(batch)).to(torch.uint8)
+            return classes_of(label_scores(*self._how(batch))).to(torch.uint8)
         # Predicted at the size of the images; class numbers are enlarged like brightness.
         small = replace(batch, label=batch.label.new_zeros(len(batch.label), *_hw(batch.rgb)))
-        found = classes_of(self.scores(small)).to(torch.uint8)
+        found = classes_of(label_scores(*self._how(small))).to(torch.uint8)
         maps = [bilinear(each, _hw(batch.label)) for each in found.cpu().numpy()]
         return torch.from_numpy(np.stack(maps)).to(found.device)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """`classes`, and the probability (B, H', W') float32 of each."""
-        scores = self.scores(batch)
+        scores = label_scores(*self._how(batch))
         # The class with the highest score has the highest probability.
         confidence = best_of(shares(scores, self.model)).score
         if self._settings.enlarged == "scores":
@@ -67,12 +67,11 @@ class Predictor:
 
     def probabilities(self, batch: Batch) -> Tensor:
         """(B, K, H', W') float32: see `rgbt.engine.evaluate.shares`."""
-        return shares(self.scores(batch), self.model)
+        return shares(label_scores(*self._how(batch)), self.model)
 
-    def scores(self, batch: Batch) -> Tensor:
-        """`rgbt.engine.evaluate.label_scores` of a batch on the device."""
+    def _how(self, batch: Batch) -> tuple[Any, ...]:
         heads = self._heads(batch.name)
-        return label_scores(self.model, batch, self._session, self.view, heads, self._settings)
+        return self.model, batch, self._session, self.view, heads, self._settings
 
 
 def _hw(images: Tensor) -> tuple[int, int]:

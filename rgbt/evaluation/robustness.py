@@ -9,7 +9,7 @@ from rgbt.assembly.session import Session
 from rgbt.config.corruption_node import ChosenCorruption
 from rgbt.engine.progress import progress
 from rgbt.evaluation.corruption import corrupted, corruption_of
-from rgbt.evaluation.measure import measurement_of, stored_or_measured
+from rgbt.evaluation.measure import files_of, measure, measurement_of, store, stored
 from rgbt.evaluation.predictor import view_of
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
@@ -45,13 +45,15 @@ def measure_all(
     session: Session, split: str, corruptions: Sequence[ChosenCorruption], out: Path | None
 ) -> list[Counts]:
     """The counts of every condition, stored beside the run or in `out`; only missing ones made."""
-    every, found = list(conditions(session, split, corruptions)), []
+    every, found = list(conditions(session, split, corruptions)), list[Counts]()
     with progress() as display:
         task = display.add_task("robustness", total=len(every), note="")
         for changed, wanted in every:
             display.update(task, note=wanted.condition)
-            file = out and out / wanted.file_name
-            found.append(next(iter(stored_or_measured(changed, wanted, out=file).files.values())))
+            files = files_of(changed, wanted, out=out and out / wanted.file_name)
+            counts = stored(changed, files)
+            counts = counts or store(files, measure(changed, wanted), {})
+            found += counts.values()
             display.advance(task)
     return found
 

@@ -54,17 +54,16 @@ def label_of(opened: Session, counts: Counts) -> str:
     return " · ".join(filter(None, (f"{opened.label} {of.dataset_name}", of.label or of.view)))
 
 
-def overview(opened: Session, files: Mapping[Path, Counts], skipped: int, *, is_new: bool) -> Group:
+def overview(opened: Session, files: Mapping[Path, Counts], note: str = "") -> Group:
     """The tables of counts and their files: of single frames first, then of details."""
     (path, counts), *others = files.items()
     label, head = label_of(opened, counts), cast(TestedHead, counts.measurement.head)
     lines = [("heads", opened.domains.heads_in_words(head))] if head else []
-    lines += [("counts", str(path) if is_new else f"{path} (measured before)")]
+    lines.append(("counts", f"{path} ({note})" if note else str(path)))
     for file, each in others:
         details = details_of(each.partition)
         assert details is not None, "the others are of details"
         lines.append((details.kind, str(file)))
-    lines += [("unreadable", f"{skipped} images")] if skipped else []
     tables = result_tables(counts, opened.regions, label, opened.step)
     return Group(
         result_view(tables, path.parent, [line for line in lines if line[1]]),

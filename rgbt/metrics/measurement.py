@@ -45,7 +45,7 @@ class Measurement:
 
     Attributes:
         run: key of the run whose network predicted; "" for others.
-        weights: SHA-256 of the network's parameters and buffers where it is of no run; "" where
+        weights: SHA-256 of the file and of the settings of a network that is of no run; "" where
             nobody knows a network.
         checkpoint: of a run, "best" or "last".
         step: the optimiser step of the weights; 0 where none is known.
@@ -59,12 +59,13 @@ class Measurement:
             computed from; (): the split itself.
         severity: of the corruption; 0 for clean images.
         settings: (key, value as JSON), sorted: `transform`, `prediction` and `trainer.precision` of
-            the configuration, `corruption` with its seed, and the size of a batch where it decides.
+            the configuration, what the data set does to the pixels of its files, `corruption` with
+            its seed; with other `statistics` also the size of a batch.
 
         absent: how a class without pixels scores (`rgbt.metrics.scores`), which is no count.
         changed: fields and keys of settings that differ from the test that the run ends with.
-        dataset_name: of the data set, in names of files; `dataset_words` are the overrides that were
-            typed for another one than that of the run.
+        dataset_name: of the data set, in names of files; `dataset_words` are the overrides that
+            were typed for another one than that of the run.
         corruption: name in files and tables: "noise_rgb", "occluded_block-16"; "" for none.
         title: of the corruption for people: "noise, RGB", and `unit` that of its severity.
     """
@@ -137,6 +138,7 @@ class Measurement:
     def words(self) -> tuple[str, ...]:
         """What was changed, in the words of conditions: ("thermal", "noise_rgb", "adabn")."""
         found = [self.view] if "view" in self.changed else []
+        found += [self.partition] if "partition" in self.changed else []
         found += [self.corruption] if self.corruption else []
         found += [f"{self.head}-head"] if "head" in self.changed else []
         if self.statistics != "as trained":
@@ -156,6 +158,7 @@ class Measurement:
     def label(self) -> str:
         """What was changed, for people: "thermal alone · noise, RGB 16 (grey levels) · AdaBN"."""
         found = [TITLES[self.view]] if "view" in self.changed else []
+        found += [self.partition] if "partition" in self.changed else []
         if self.corruption:
             found += [f"{self.title} {self.severity:g} ({self.unit})" if self.unit else self.title]
         found += [f"{self.head} head"] if "head" in self.changed else []
@@ -175,8 +178,7 @@ class Measurement:
         """
         if self.is_own:
             return f"counts_{self.split}.npz"
-        is_cut = "partition" in self.changed or not self.run
-        words = [self.split, *([self.partition] if is_cut else [])]
+        words = [self.split, *([] if self.run or "partition" in self.changed else [self.partition])]
         settings = [f"{key}={value}" for key, value in self._changed_settings().items()]
         for word in self.words[: len(self.words) - len(settings)]:
             is_corruption = self.unit and word == self.corruption

@@ -52,12 +52,6 @@ def protocol_of(partition: str) -> Protocol | None:
     return next((each for each in PROTOCOLS if found and found[1] == each), None)
 
 
-def file_name(protocol: Protocol, split: str, views: str = "") -> str:
-    """Where counts of pairs lie inside a run folder; `views` as for `partition_name`."""
-    name = f"{protocol}-{views}".rstrip("-")
-    return f"evaluations/consistency_{name}_{split}.npz"
-
-
 def tc(pairs: Matrices, absent: Absent) -> Scores:
     """Temporal consistency of each class, a fraction 0..1: IoU of the two predictions.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,12 @@ from rgbt.terminal import warn
 # Files of counts in a run folder: of what the run ended with, and of what was measured since.
 COUNTS = ("counts_*.npz", "evaluations/*.npz")
 OWN = "counts_test.npz"
+
+
+@lru_cache(maxsize=10_000)
+def _measurement(path: Path, _changed: int, _size: int) -> Measurement:
+    """What a file is of; tables ask again and again."""
+    return read_measurement(path)
 
 
 @dataclass(frozen=True)
@@ -154,7 +161,9 @@ class RunResult:
         found = {}
         for path in sorted(path for pattern in COUNTS for path in self.folder.glob(pattern)):
             try:
-                found[path.relative_to(self.folder).as_posix()] = read_measurement(path)
+                file = path.stat()
+                known = _measurement(path, file.st_mtime_ns, file.st_size)
+                found[path.relative_to(self.folder).as_posix()] = known
             except InputError as error:
                 warn(f"{path} is left out: {error}")
         return found

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
+from tests.measured import measurement
 
 
 def counts_of(array: Any, **changed: Any) -> Counts:
-    """(N, R, K, K), or of one image (R, K, K), counts as `Counts`; `changed`: other attributes."""
+    """(N, R, K, K), or of one image (R, K, K), counts as `Counts`.
+
+    `changed`: other attributes of the counts, and fields of their measurement.
+    """
     counts = np.asarray(array)
     counts = counts if counts.ndim == 4 else counts[None]
     values: dict[str, Any] = {
@@ -19,10 +24,10 @@ def counts_of(array: Any, **changed: Any) -> Counts:
         "night": None,
         "classes": tuple(f"class{index}" for index in range(counts.shape[-1])),
         "partition": f"ring{counts.shape[1]}",
-        "dataset": "fingerprint",
-        "split": "test",
     }
-    return Counts(counts=counts, **(values | changed))
+    values |= changed
+    own = {each.name: values.pop(each.name) for each in fields(Counts) if each.name in values}
+    return Counts(counts=counts, **({"measurement": measurement(**values)} | own))
 
 
 def result_of(key: str, counts: Counts) -> dict[str, Any]:

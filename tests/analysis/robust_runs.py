@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.measurement import CLEAN
 from rgbt.runs.folder import Description, RunFolder
 from tests.analysis.counts import counts_of, result_of
+from tests.measured import differing, store
 
 Scores = dict[tuple[str, str, str, float], int]
 SCORES: Scores = {
     ("clean", "clean", "", 0.0): 80,
     ("rgb_removed", "RGB removed (zeroed)", "", 1.0): 20,
-    ("features-thermal", "thermal alone (features)", "", 1.0): 30,
+    ("thermal", "thermal alone", "", 0.0): 30,
     ("noise", "noise, RGB and thermal", "grey levels (std)", 8.0): 60,
     ("noise", "noise, RGB and thermal", "grey levels (std)", 16.0): 40,
 }
-"""(row, title, unit, severity) -> mIoU in percent."""
+"""(condition, title, unit, severity) -> mIoU in percent."""
 
 PIXELS = 100_000
 
@@ -33,14 +36,24 @@ def right(percent: int, images: int = 12) -> Counts:
     return counts_of(np.array([[[[a, PIXELS - a], [PIXELS - a, a]]]] * images))
 
 
+def measured(scores: Scores) -> Iterator[tuple[Counts, dict[str, Any]]]:
+    """The counts of each condition, and in which fields it differs from clean images."""
+    for (condition, title, unit, severity), percent in scores.items():
+        if condition == CLEAN:
+            yield right(percent), {}
+        elif condition == "thermal":
+            yield right(percent), {"view": condition}
+        else:
+            shown = {"corruption": condition, "title": title, "unit": unit}
+            yield right(percent), {"severity": severity, **shown}
+
+
 def write_levels(folder: Path, scores: Scores) -> Path:
-    """The files of one training."""
+    """What rgbt robustness writes of one training to another folder than that of its run."""
     folder.mkdir(parents=True, exist_ok=True)
-    for (row, title, unit, severity), percent in scores.items():
-        mark = row if row == "clean" or row.startswith("features") else f"{row}-{severity:g}"
-        right(percent).save(folder / f"{mark}.npz")
-        made = {"row": row, "title": title, "unit": unit, "severity": severity}
-        write_json(folder / f"{mark}.json", made)
+    for counts, fields in measured(scores):
+        found = differing(counts, run="0123456789ab", **fields)
+        found.save(folder / found.measurement.file_name)
     return folder
 
 
@@ -49,11 +62,10 @@ def write_run(runs: Path, key: str, group: str, seed: int, scores: Scores) -> Pa
     run = RunFolder(runs / key)
     run.write_config("name: x\n")
     run.describe(Description(key, {"rgbt.group": group, "rgbt.seed": str(seed)}, {}))
-    counts = right(80)
-    counts.counts[..., 0, :] += np.array([-seed, seed])  # other predictions of the same labels
-    counts.save(run.path / "counts_test.npz")
-    run.finish(result_of(key, counts))
-    write_levels(run.path / "evaluations" / "robustness" / "test", scores)
+    for counts, fields in measured(scores):
+        store(run.path, counts, **fields)
+        if not fields:
+            run.finish(result_of(key, counts))
     return run.path
 
 

@@ -18,14 +18,16 @@ from analysis import archive
 from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.files.plain_files import write_json
+from rgbt.metrics import measurement
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder, read_result
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult
 from tests.analysis.counts import counts_of, result_of
-from tests.analysis.robust_runs import SCORES, write_levels
+from tests.analysis.robust_runs import SCORES, measured
 from tests.commands import Call
 from tests.composed import specified
+from tests.measured import remeasured, store
 
 WORDS = ("+experiment=crm", "+debug=smoke")
 
@@ -45,7 +47,7 @@ PAIRS = counts_of(np.random.default_rng(9).integers(0, 9, (12, 15, 4, 4)), parti
 
 
 # No table reads these.
-NOT_ARCHIVED = ("counts_test_source_head.npz", "counts_val.npz", "evaluations/val_rgb.npz")
+NOT_ARCHIVED = ("counts_val.npz", "evaluations/val_rgb.npz")
 
 
 def finish(folder: Path, counts: Counts) -> None:
@@ -63,13 +65,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
     folder.describe(describe(spec))
     folder.add_provenance({"git_commit": "a" * 40, "cwd": "/home/me", "packages": {"torch": "2"}})
-    some(0, run=spec.key).save(folder.path / "counts_test_source_head.npz")
-    (folder.path / "evaluations").mkdir()
-    for name in NOT_ARCHIVED[1:]:
-        some(0, run=spec.key, split="val").save(folder.path / name)
-    some(1).save(folder.path / "evaluations/test_rgb.npz")
-    PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
-    write_levels(folder.path / "evaluations/robustness/test", SCORES)
+    store(folder.path, some(0), split="val")
+    store(folder.path, some(0), split="val", view="rgb")
+    store(folder.path, some(1), view="rgb")
+    store(folder.path, PAIRS)
+    for counts, fields_ in measured(SCORES):
+        if fields_:
+            store(folder.path, counts, **fields_)
     finish(folder.path, some(0, run=spec.key))
     add(RunResult(folder.path), root / "results")
     return RunResult(folder.path)
@@ -103,6 +105,7 @@ def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
         assert first.counts.dtype == again.counts.dtype
         others = [field.name for field in fields(Counts) if field.name != "counts"]
         assert [getattr(first, each) for each in others] == [getattr(again, e) for e in others]
+        assert first.measurement.to_json() == again.measurement.to_json()
     assert (unpacked.key, unpacked.commit) == (run.key, "a" * 10)
     assert unpacked.recorded_scores() == run.recorded_scores()
     assert unpacked.description == replace(run.description, params={})
@@ -125,7 +128,7 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
     finish(run.folder, some(2, run=run.key))
     other = add(run, archive)
     assert key_of(other) == run.key
-    assert unpack(other, tmp_path / "unpacked").counts().run == run.key
+    assert unpack(other, tmp_path / "unpacked").counts().measurement.run == run.key
     assert archived(archive) == [archive / f"{run.key}.zip", other]  # the first is read
 
 
@@ -138,7 +141,7 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
     wrong = PAIRS.counts.copy()
     wrong[:, 1, 3, 2] += wrong[:, 1, 1, 1]  # of pixels with label 1 in both frames
     wrong[:, 1, 1, 1] = 0
-    replace(PAIRS, counts=wrong).save(run.folder / "evaluations/consistency_aligned_test.npz")
+    store(run.folder, replace(PAIRS, counts=wrong))
     add(run, tmp_path / "results")
     assert len(list((tmp_path / "results/shared").iterdir())) == before == 4
 
@@ -214,9 +217,9 @@ def test_check_reports_changed_keys(
     archive = tmp_path / "other"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
-    for name in NOT_ARCHIVED:
-        (folder / name).unlink()
-    finish(folder, some(0, run="0123456789ab"))
+    for path in folder.rglob("*.npz"):
+        remeasured(Counts.load(path), run=folder.name).save(path)
+    finish(folder, some(0, run=folder.name))
     add(RunResult(folder), archive)
     code, out, _ = call(entry, "check", f"archive={archive}")
     assert code == 1
@@ -225,7 +228,9 @@ def test_check_reports_changed_keys(
     assert call(entry, "rekey", f"archive={archive}")[0] == 0
     (only,) = archived(archive)
     assert only.stem == (run.key if state == "added" else "0123456789ab")
-    assert unpack(only, tmp_path / "unpacked").counts().run == only.stem
+    unpacked = unpack(only, tmp_path / "unpacked").measurements()
+    assert {of.run for of in unpacked.values()} == {only.stem}
+    assert len(unpacked) == 7
     assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
 
 
@@ -278,8 +283,10 @@ TAMPERED: dict[str, tuple[str, Callable[[], Counts], str]] = {
     "other_labels": ("evaluations/test_rgb.npz", other_label, "other labels than counts_test"),
     "other_regions": ("counts_test.npz", lambda: some(0, partition="vertical5"), "of vertical5"),
     "fewer_regions": ("counts_test.npz", lambda: some(0, partition="ring9"), "expected 9 rows"),
-    "codes": ("counts_test.npz", lambda: some(0, partition=f"ring5{CODES}"), "letters, digits"),
-    "codes_of_split": ("counts_test.npz", lambda: some(0, split=CODES), "without control"),
+    "markup": ("counts_test.npz", lambda: some(0, partition=CODES[1:]), "letters, digits"),
+    "codes": ("counts_test.npz", lambda: some(0, partition=f"ring5{CODES}"), "has control"),
+    "codes_of_split": ("counts_test.npz", lambda: some(0, split=CODES), "has control"),
+    "codes_of_title": ("evaluations/test_rgb.npz", lambda: some(1, title=CODES), "has control"),
     "codes_of_class": (
         *("counts_test.npz", lambda: some(0, classes=(CODES, "b", "c", "d"))),
         "without control",
@@ -320,8 +327,8 @@ def test_names_of_images_may_have_any_space(tmp_path: Path) -> None:
 
 
 def test_rows_that_pairs_cannot_have_are_refused(run: RunResult) -> None:
-    odd = replace(some(0), counts=some(0).counts[:, :4], partition="aligned3")
-    odd.save(run.folder / "evaluations/consistency_x_test.npz")
+    odd = replace(some(0), counts=some(0).counts[:, :4])
+    store(run.folder, odd, partition="aligned3")
     with pytest.raises(InputError, match="other rows than aligned3"):
         run.check()
 
@@ -352,6 +359,7 @@ def test_changed_numbers_are_no_result(
             add(run, tmp_path / "other")
     with monkeypatch.context() as patch:  # a stranger packs without our checks
         patch.setattr(Counts, "check", lambda _: None)
+        patch.setattr(measurement, "CONTROL", re.compile("(?!)"))
         patch.setattr(RunResult, "check", lambda _: None)
         add(run, tmp_path / "other")
     code, out, _ = call(entry, "check", f"archive={tmp_path / 'other'}")

@@ -15,12 +15,13 @@ from rgbt.checks import InputError
 from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.metrics.pairs import PROTOCOLS, file_name
+from rgbt.metrics.pairs import PROTOCOLS
 from rgbt.runs.folder import Description, RunFolder, lists_of
 from tests.analysis.robust_runs import SCORES, less, write_run
 from tests.analysis.test_results import COMMAS, make_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
 from tests.commands import Call, assert_one_sentence
+from tests.measured import differing, remeasured, store
 
 FAST = ("resamples=200", "blocks=none")
 SETTINGS = Resampling(resamples=200, blocks="none")
@@ -79,6 +80,18 @@ def test_table_sentence_and_files_hold_the_compared_numbers(
         shown = [f"{each.a.value:.2f}", f"{each.b.value:.2f}", f"{each.value:+.2f}"]
         ends = f"{each.interval.low:+.2f} to {each.interval.high:+.2f}"
         assert " | ".join([each.metric, *shown, ends]) in text
+
+
+def test_other_measurements_are_said_and_are_no_seeds(call: Call, tmp_path: Path) -> None:
+    a, b = pair()
+    other = differing(b, view="thermal", statistics="adabn")
+    code, out, err = call(entry, *saved(tmp_path, a, other), *FAST, f"out={tmp_path}")
+    assert (code, err) == (0, "")
+    said = "Measured differently (statistics: as trained, adabn; view: rgbt, thermal)."
+    assert said in " ".join(out.split())
+    assert said in (tmp_path / "comparison.md").read_text()
+    with pytest.raises(InputError, match=r"seeds .* measured differently \(statistics: as trained"):
+        compare([a], [b, other], ["mIoU"], SETTINGS)
 
 
 @pytest.mark.parametrize("name", [COMMAS, "x=[/y]"])
@@ -140,10 +153,8 @@ def paired_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for group, agree in AGREE.items():
         for seed in range(2):
             folder = make_run(runs, f"{group}{seed}", group, seed)
-            (folder / "evaluations").mkdir()
             for protocol in ("aligned", "released"):
-                counts = replace(pairs_of(IMAGES, agree, seed, NIGHT), partition=f"{protocol}3")
-                counts.save(folder / file_name(protocol, "test"))
+                store(folder, pairs_of(IMAGES, agree, seed, NIGHT), partition=f"{protocol}3")
     make_run(runs, "bare0", "bare", 0)
     return runs
 
@@ -168,7 +179,7 @@ def test_difference_in_tc_has_interval_over_images_and_seeds(
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_auto_metrics_are_those_of_the_protocol(protocol: str) -> None:
-    counts = replace(pairs_of(IMAGES, 0.5, night=NIGHT), partition=f"{protocol}3")
+    counts = remeasured(pairs_of(IMAGES, 0.5, night=NIGHT), partition=f"{protocol}3")
     whole = {
         "released": ["TC", "CA_released"],
         "flow": ["TC", "CA", "warping_error"],

@@ -24,6 +24,7 @@ from tests.analysis import counts as makes
 from tests.analysis.test_results import make_run
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call, assert_one_sentence
+from tests.measured import store
 
 IMAGES = 40
 SETTINGS = Resampling(resamples=2000, blocks="none")
@@ -94,18 +95,13 @@ def runs(tmp_path: Path) -> Path:
     runs = tmp_path / "runs"
     for seed in range(2):
         folder = make_run(runs, f"plain{seed}", "plain", seed)
-        plain = counts_of(np.full((IMAGES, 2, 2, 2), 1 + seed), "ring2")
-        dataset = plain.dataset
-        plain.save(folder / "counts_test.npz")
+        plain = counts_of(np.broadcast_to([[2 - seed, seed], [1, 3]], (IMAGES, 2, 2, 2)), "ring2")
+        store(folder, plain)
         RunFolder(folder).finish(makes.result_of(folder.name, plain))
         for view in ("rgbt", "thermal"):
-            for kind, made in (("boundary", boundaries(seed)), ("calibration", calibrated(seed))):
-                (folder / "evaluations").mkdir(exist_ok=True)
-                name = f"synth_test_{view}_{made.partition.split('-')[0]}-{kind}.npz"
-                replace(made, dataset=dataset).save(folder / "evaluations" / name)
-        replace(boundaries(9), dataset="other").save(
-            folder / "evaluations" / "kitti_test_rgb_ring2-boundary.npz"
-        )
+            for made in (boundaries(seed), calibrated(seed)):
+                store(folder, made, view=view)
+        store(folder, boundaries(9), view="rgb", dataset="other", dataset_name="kitti")
     make_run(runs, "bare0", "bare", 0)
     return runs
 
@@ -117,16 +113,17 @@ def test_seeds_of_a_method_are_shown_together(call: Call, runs: Path, tmp_path: 
     assert "intervals over images and seeds" in out
     rows = list(csv.DictReader((tmp_path / "out" / "details.csv").open()))
     assert {(row["details"], row["input"]) for row in rows} == {
-        (kind, view) for kind in ("boundary", "calibration") for view in ("rgbt", "thermal")
+        ("", "rgbt"),
+        *((kind, view) for kind in ("boundary", "calibration") for view in ("rgbt", "thermal")),
     }
     (row,) = (each for each in rows if (each["metric"], each["input"]) == ("ECE", "rgbt"))
     expected = [value("ECE", calibrated(seed), "released") for seed in range(2)]
     assert float(row["value"]) == pytest.approx(np.mean(expected))
     assert float(row["low"]) < float(row["value"]) < float(row["high"])
     assert row["seeds"] == "2"
-    # Tables of one line have one for each input.
+    # Tables of one line have one for each input: of single frames both images, of ECE also thermal.
     lines = (tmp_path / "out" / "details.md").read_text().splitlines()
-    assert sum(line.startswith(("| rgbt |", "| thermal |")) for line in lines) == 2
+    assert sum(line.startswith(("| rgbt |", "| thermal |")) for line in lines) == 3
     assert call(entry, "run=plain0", *words)[0] == 0
 
 
@@ -144,8 +141,8 @@ def test_file_of_pairs_is_shown_by_videos(call: Call, tmp_path: Path) -> None:
 
 
 def test_missing_details_are_named(call: Call, runs: Path) -> None:
-    (runs / "plain1" / "evaluations" / "synth_test_thermal_ring1-calibration.npz").unlink()
-    with pytest.raises(InputError, match="condition=thermal is not counted .* has clean of"):
+    (runs / "plain1" / "evaluations" / "test_thermal_ring1-calibration-2.npz").unlink()
+    with pytest.raises(InputError, match="condition=thermal is not counted .* has clean, "):
         open_counts("plain1", runs, condition="thermal")  # the rest are details
     for words, sentence in (
         (["run=bare"], "modality=all details=boundary"),

@@ -11,9 +11,7 @@ import pytest
 
 from analysis.archive import add
 from analysis.results import (
-    CLEAN,
     COLUMNS,
-    ROBUSTNESS,
     finished_runs,
     label_of,
     open_counts,
@@ -21,15 +19,15 @@ from analysis.results import (
     trainings,
 )
 from rgbt.checks import InputError
-from rgbt.evaluation import robustness
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
-from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.runs.folder import Description, RunFolder
 from rgbt.runs.result import RunResult
 from tests.analysis.counts import result_of
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
+from tests.measured import remeasured, store
 
 CRM, COMMAS = "crm scale=demo", "grbm scale=demo sizes=[1,2]"
 LONG = "grbm " + " ".join(f"a_long_key_of_the_configuration_{n}=0.123" for n in range(10))
@@ -45,8 +43,8 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     run.write_config("name: x\n")
     tags = {"rgbt.group": group, "rgbt.seed": str(seed)} if group else {}
     run.describe(Description(f"{group} seed={seed}", tags, {}))
-    some(seed).save(run.path / counts_name("test"))
-    replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
+    store(run.path, some(seed))
+    store(run.path, some(seed + 100), split="val")
     write_json(run.path / "mlflow.json", {"run_id": f"mlflow-{key}"})
     if finished:
         run.finish(result_of(key, some(seed)))
@@ -109,6 +107,12 @@ def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("HOME", str(runs.parent))
     (found,) = open_counts("~/other method.npz")
     np.testing.assert_array_equal(found.counts.counts, some(7).counts)
+
+
+def test_a_file_of_a_run_is_called_after_its_measurement(runs: Path) -> None:
+    path = store(runs / "aaa1", some(8), view="thermal")
+    found = open_counts(str(path), runs)
+    assert (label_of(found), found[0].key) == ("aaa1 · thermal alone", "")
 
 
 def test_folder_of_scores_is_opened_by_rings(tmp_path: Path) -> None:
@@ -186,15 +190,12 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     night = tuple(place < 4 for place in range(12))
     counts, pairs = replace(some(0), night=night, unscored=("cone",)), pairs_of(12, 0.5)
     folder = runs / "bbb0"
-    (folder / "evaluations").mkdir()
-    for name, each in (
-        ("synth_test_thermal_ring2", counts),
-        ("consistency_aligned_test", pairs),
-        ("consistency_aligned-0c_test", pairs),
-    ):
-        each.save(folder / f"evaluations/{name}.npz")
-    replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
-    replace(some(100), split="val").save(folder / "evaluations/synth_val_thermal_ring2.npz")
+    store(folder, counts, view="thermal")
+    kp = {"dataset": "0123456789", "dataset_name": "kp"}
+    store(folder, counts, view="rgb", checkpoint="last", step=9, **kp)
+    store(folder, some(100), view="thermal", split="val")
+    for mark in ("", "-0c"):
+        store(folder, pairs, partition=f"{pairs.partition}{mark}")
     write_run(runs, "fff0", "robust", 0, SCORES)
     frame = results(runs, archive)
     at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
@@ -203,20 +204,23 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     found = frame.set_index(["run", "condition", "subset", "region", "class", "metric"])["value"]
     for run, condition, of in (
         *(("bbb0", "clean", some(0)), ("aaa1", "clean", some(1)), ("bbb0", "thermal", counts)),
-        ("bbb0", "rgb last dataset other", counts),
+        ("bbb0", "rgb last-9 kp-01234567", counts),
     ):
         for name in ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "pixel_accuracy"):
             for prefix in ("", "night/")[: 1 + (of is counts)]:
                 each = parse(f"{prefix}{name}")
                 key = each.part or "all", each.region or 0, each.class_name or "", each.score
                 assert found[run, condition, *key] == value(f"{prefix}{name}", of, "released")
-    region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
+    region = remeasured(replace(counts, counts=counts.counts[:, 1:]), partition="ring1")
     person = value("class/person", region, "released")
     assert found["bbb0", "thermal", "all", 2, "person", "IoU"] == person
-    for condition in ("clean", "clean 0c"):
-        assert found["bbb0", condition, "all", 0, "", "TC"] == value("TC", pairs, "released")
+    of_pairs = frame[(frame["metric"] == "TC") & (frame["subset"] == "all")]
+    of_pairs = of_pairs[of_pairs["class"] == ""]
+    for mark in ("", "-0c"):
+        (tc,) = of_pairs["value"][of_pairs["condition"] == f"aligned3{mark}"]
+        assert tc == value("TC", pairs, "released")
     (aligned,) = open_counts("bbb0", runs, frames="aligned")
-    assert aligned.path.stem == "consistency_aligned_test"
+    assert aligned.counts.partition == "aligned3"
     chosen = (frame["metric"] == "mIoU") & (frame["subset"] == "all") & (frame["region"] == 0)
     noise = frame[chosen & (frame["condition"] == "noise")]
     assert dict(zip(noise["severity"], noise["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
@@ -247,16 +251,14 @@ def measured(tmp_path: Path) -> Path:
 
 
 def test_trainings_have_levels_by_title_and_rising_severity(measured: Path) -> None:
-    assert (CLEAN, ROBUSTNESS) == (robustness.CLEAN, robustness.FOLDER)
     first, second = trainings("crm", measured)
     assert [level.path.stem for level in first.levels] == [
-        *("clean", "rgb_removed-1", "features-thermal", "noise-8", "noise-16")
+        *("counts_test", "test_rgb_removed", "test_thermal", "test_noise-8", "test_noise-16")
     ]
     mious = [value("mIoU", level.counts, "released") for level in first.levels]
     assert mious == pytest.approx([80, 20, 30, 60, 40], abs=1e-3)
     assert value("mIoU", second.levels[0].counts, "released") == pytest.approx(70, abs=1e-3)
-    assert [level.severity for level in first.levels if level.row == "noise"] == [8.0, 16.0]
-    assert "frozen" not in {level.row for level in first.levels}
+    assert [level.severity for level in first.levels if level.condition == "noise"] == [8, 16]
     folder = write_levels(measured / "elsewhere", SCORES)
     assert [each.label for each in trainings(f"{folder},k2", measured)] == ["elsewhere", "none"]
 
@@ -274,6 +276,6 @@ def test_same_trainings_on_corrupted_images(measured: Path, condition: str, miou
 
 @pytest.mark.parametrize("condition", ["nois 16", "noise 12", "noise"])
 def test_missing_condition_is_reported(measured: Path, condition: str) -> None:
-    known = "clean, features-thermal 1, noise 16, noise 8, rgb_removed 1"
+    known = "clean, noise 16, noise 8, rgb_removed 1, thermal of"
     with pytest.raises(InputError, match=f"condition={condition} is not counted .* has {known}"):
         open_counts("k0", measured, condition=condition)

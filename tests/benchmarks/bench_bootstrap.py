@@ -18,6 +18,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from tests.benchmarks.timing import medians
+from tests.measured import measurement
 
 IMAGES, REGIONS, CLASSES = 393, 5, 9
 RESAMPLES = 10_000
@@ -50,9 +51,7 @@ def drawn(seeds: int, skill: float) -> list[Counts]:
                 names=tuple(f"{number:05d}D" for number in range(IMAGES)),
                 night=None,
                 classes=tuple(f"class{number}" for number in range(CLASSES)),
-                partition="ring5",
-                dataset="simulated",
-                split="test",
+                measurement=measurement(),
             )
         )
     return found

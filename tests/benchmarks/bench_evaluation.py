@@ -22,8 +22,7 @@ import torch
 from rgbt.assembly.session import open_session
 from rgbt.config.compose import compose
 from rgbt.data.loaders import eval_batches
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import evaluate
+from rgbt.evaluation import measure
 from rgbt.runs.specify import specify
 from rgbt.types import Batch
 
@@ -57,7 +56,7 @@ CASES = {
 }
 
 
-def measure(case: Case, folder: Path) -> tuple[float, float]:
+def measured(case: Case, folder: Path) -> tuple[float, float]:
     """CPU seconds of the evaluation of a split and of the forward passes alone."""
     sizes = [f"dataset.num_{split}=2" for split in ("train", "val")]
     words = [*case.overrides, *sizes, f"dataset.num_test={case.images}"]
@@ -70,7 +69,7 @@ def measure(case: Case, folder: Path) -> tuple[float, float]:
         _forward(session.model.eval(), in_memory)
 
     def whole() -> None:
-        evaluate(session, session.model, EvaluationRequest(split="test"))
+        measure.measure(session, measure.measurement_of(session, "test"))
 
     times = medians({"evaluate": whole, "forward": forward}, ROUNDS)
     return times["evaluate"][0], times["forward"][0]
@@ -86,7 +85,7 @@ def main() -> None:
     print("CPU s per image                 evaluate   forward    ratio")
     for name in sys.argv[1:] or CASES:
         with TemporaryDirectory() as folder:
-            whole, forward = measure(CASES[name], Path(folder))
+            whole, forward = measured(CASES[name], Path(folder))
         images = CASES[name].images
         row = f"{whole / images:9.4f} {forward / images:9.4f} {whole / forward:8.2f}"
         print(f"{name:<30} {row}", flush=True)

@@ -176,7 +176,8 @@ def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path
 
 
 def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> None:
-    from rgbt.evaluation.request import choose_corruption
+    from rgbt.config.corruption_node import choose_corruption
+    from rgbt.evaluation.corruption import corruption_of
 
     path = tmp_path / "fog.yaml"
     path.write_text(f"_target_: os.system\ncommand: touch {tmp_path / 'marker'}\n")
@@ -186,7 +187,7 @@ def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> 
     with pytest.raises(InputError, match="add trust=my_lab"):
         choose_corruption(str(path))
     assert not (lab / "my_lab.imported").exists()
-    choose_corruption(str(path), trust=("my_lab",))
+    corruption_of(choose_corruption(str(path), trust=("my_lab",)))
     assert (lab / "my_lab.imported").exists()
     assert not (tmp_path / "marker").exists()
 

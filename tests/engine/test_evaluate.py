@@ -12,7 +12,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.checks import RunError
-from rgbt.engine.evaluate import class_maps, class_scores, confident_class_maps, probabilities
+from rgbt.engine.evaluate import class_maps, class_scores, label_scores, shares
 from rgbt.engine.prediction import Prediction
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, Output, View
@@ -105,9 +105,12 @@ def share(grey: float, column: int) -> float:
     return one / (one + other)
 
 
+def probabilities(model: nn.Module, data: Batch, settings: Prediction) -> Tensor:
+    return shares(label_scores(model, data, FABRIC, settings=settings), model)
+
+
 def predicted(data: Batch, **settings: Any) -> np.ndarray:
-    shares = probabilities(Ramp(), data, FABRIC, settings=Prediction(**settings))
-    return np.asarray(shares[0, 0])
+    return np.asarray(probabilities(Ramp(), data, Prediction(**settings))[0, 0])
 
 
 ROW = [0.9, 0.1, 0.4, 0.3, 0.8, 0.2, 0.7]
@@ -153,12 +156,9 @@ def test_aligned_corners_enlarge_the_scores() -> None:
         np.testing.assert_allclose(predicted(data, align_corners=aligned)[0], expected, atol=1e-6)
 
 
-def test_classes_and_confidences_agree_with_the_probabilities() -> None:
+def test_classes_agree_with_the_probabilities() -> None:
     data = grey([ROW, ROW[::-1]], (4, 14))
     settings = Prediction(mirrored=True, window_hw=(2, 4), align_corners=True)
-    shares = probabilities(Ramp(), data, FABRIC, settings=settings)
-    classes, confidence = confident_class_maps(Ramp(), data, FABRIC, settings=settings)
-    assert torch.equal(classes.long(), shares.argmax(1))
-    torch.testing.assert_close(confidence, shares.amax(1))
-    assert torch.equal(class_maps(Ramp(), data, FABRIC, settings=settings), classes)
-    torch.testing.assert_close(shares.sum(1), torch.ones(1, 4, 14))
+    found = probabilities(Ramp(), data, settings)
+    assert torch.equal(class_maps(Ramp(), data, FABRIC, settings=settings).long(), found.argmax(1))
+    torch.testing.assert_close(found.sum(1), torch.ones(1, 4, 14))

@@ -16,9 +16,10 @@ from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
-from rgbt.evaluation.prediction import Predictor, normalised
-from rgbt.evaluation.request import BatchNormRequest, EvaluationRequest
-from rgbt.evaluation.segmentation import evaluate
+from rgbt.evaluation.batch_norm import normalised
+from rgbt.evaluation.measure import measure, measurement_of
+from rgbt.evaluation.predictor import Predictor
+from rgbt.metrics.measurement import Measurement, Statistics
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
 from rgbt.types import Output
@@ -56,8 +57,8 @@ def session(data: Path) -> Session:
     return replace(session, dataset=Days(data), model=AboveMean())
 
 
-def request(kind: str, *splits: str) -> EvaluationRequest:
-    return EvaluationRequest(split="test", batch_norm=BatchNormRequest(kind=kind, splits=splits))
+def wanted(session: Session, kind: Statistics = "as trained", *splits: str) -> Measurement:
+    return measurement_of(session, "test", batch_norm=kind, batch_norm_splits=",".join(splits))
 
 
 def pixels(session: Session, *names: str) -> NDArray[np.float64]:
@@ -70,12 +71,12 @@ def pixels(session: Session, *names: str) -> NDArray[np.float64]:
 @pytest.mark.parametrize("size", [1, 3])
 def test_statistics_are_those_of_all_pixels_in_any_order(session: Session, size: int) -> None:
     session = replace(session, loading=replace(session.loading, eval_batch_size=size))
-    model, predictor = session.model, Predictor(session, session.model, request("recomputed"))
+    model, predictor = session.model, Predictor(session)
     before = {name: each.clone() for name, each in model.state_dict().items()}
     names = tuple(SPLITS["train"])
     expected = pixels(session, *names)
     for sources in (names, names[::-1]):
-        with normalised(session, predictor, request("recomputed"), sources):
+        with normalised(session, predictor, wanted(session, "recomputed"), sources):
             assert model.norm.running_mean.numpy() == pytest.approx(expected.mean(0), abs=1e-6)
             assert model.norm.running_var.numpy() == pytest.approx(expected.var(0), abs=1e-6)
             assert torch.equal(model.unused.running_var, torch.ones(2))
@@ -97,9 +98,13 @@ TRAIN_DAYS, TRAIN_NIGHTS = ([n for n in SPLITS["train"] if n[-1] == t] for t in 
     ],
 )
 def test_counts_are_of_the_statistics_of_each_domain(
-    session: Session, kind: str, splits: tuple[str, ...], of_day: list[str], of_night: list[str]
+    session: Session,
+    kind: Statistics,
+    splits: tuple[str, ...],
+    of_day: list[str],
+    of_night: list[str],
 ) -> None:
-    result = evaluate(session, session.model, request(kind, *splits))
+    result = measure(session, wanted(session, kind, *splits))
     assert result.counts.names == tuple(SPLITS["test"])
     for name, counts in zip(result.counts.names, result.counts.counts, strict=True):
         mean = pixels(session, *(of_night if name[-1] == "N" else of_day))[:, 3].mean()
@@ -109,38 +114,44 @@ def test_counts_are_of_the_statistics_of_each_domain(
     assert torch.equal(session.model.norm.running_mean, torch.zeros(4))
     # Without the option, the network keeps its own mean of 0, and every batch is whole.
     session.model.sizes.clear()
-    plain = evaluate(session, session.model, EvaluationRequest(split="test")).counts.counts
+    plain = measure(session, wanted(session)).counts.counts
     assert plain.sum((0, 1, 2))[0] == (pixels(session, *SPLITS["test"])[:, 3] == 0).sum()
     assert session.model.sizes == [2, 1]
 
 
 def test_statistics_that_cannot_be_computed_are_refused(session: Session) -> None:
     with pytest.raises(InputError, match="batch_norm_splits=days"):
-        evaluate(session, session.model, request("adabn", "days"))
+        measure(session, wanted(session, "adabn", "days"))
     assert not session.model.sizes
     exported = nn.Sequential(nn.BatchNorm2d(3, track_running_stats=False))
     exported.record = AboveMean.record
     with pytest.raises(InputError, match="batch_norm=adabn"):
-        evaluate(session, exported, request("adabn"))
+        measure(replace(session, model=exported), wanted(session, "adabn"))
 
 
 @pytest.mark.parametrize("kind", ["batch", "adabn"])
-def test_one_value_for_each_channel_is_refused(session: Session, kind: str) -> None:
+def test_one_value_for_each_channel_is_refused(session: Session, kind: Statistics) -> None:
     """Of a batch of one image at night it would be normalised to 0, whatever the image."""
     model = session.model
     model.norm.register_forward_pre_hook(lambda _, inputs: (inputs[0].mean((2, 3), keepdim=True),))
     with pytest.raises(InputError, match=r"set data\.eval_batch_size"):
-        evaluate(session, model, request(kind))
+        measure(session, wanted(session, kind))
     assert torch.equal(model.norm.running_mean, torch.zeros(4))
 
 
-def test_options_make_the_request() -> None:
-    made = BatchNormRequest.from_options
-    assert made("as trained", "") is None
-    assert made("batch", "") == BatchNormRequest(kind="batch")
-    found = made("adabn", "train_day,train_night,train_day")
-    assert found == BatchNormRequest(kind="adabn", splits=("train_day", "train_night"))
-    assert found.file_stem == "norm-adabn-train_day-train_night"
-    for kind in ("as trained", "batch"):
+def test_options_make_the_measurement(session: Session) -> None:
+    """The size of a batch belongs to statistics of each batch alone."""
+    size = ("data.eval_batch_size", str(session.loading.eval_batch_size))
+    plain, batch = wanted(session), wanted(session, "batch")
+    assert (plain.statistics, plain.statistics_of, plain.changed) == ("as trained", (), ())
+    assert (batch.statistics, batch.statistics_of) == ("batch", ())
+    assert set(batch.settings) - set(plain.settings) == {size}
+    found = wanted(session, "adabn", "train_day", "train_night", "train_day")
+    assert (found.statistics, found.statistics_of) == ("adabn", ("train_day", "train_night"))
+    assert found.words == ("adabn-train_day-train_night",)
+    assert found.label == "AdaBN of train_day, train_night"
+    assert found.settings == plain.settings
+    kinds: tuple[Statistics, ...] = ("as trained", "batch")
+    for kind in kinds:
         with pytest.raises(InputError, match=f"batch_norm={kind}"):
-            made(kind, "val")
+            wanted(session, kind, "val")

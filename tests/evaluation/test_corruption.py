@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.evaluation.request import (
-    CorruptedDataset,
+from rgbt.config.corruption_node import (
     choose_corruption,
     choose_corruptions,
     standard_corruptions,
 )
+from rgbt.evaluation.corruption import CorruptedDataset, corruption_of, severity_of
 from tests.corruptions.recorded import NAMES, Recorded, sample
 
 
 def corrupted(source: Recorded, name: str, severity: float, *words: str) -> CorruptedDataset:
-    return CorruptedDataset(source, choose_corruption(name, words).at(str(severity)), "test")
+    chosen = choose_corruption(name, words)
+    return CorruptedDataset(source, chosen, severity_of(chosen, str(severity)), "test")
 
 
 def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
@@ -89,7 +90,8 @@ def test_frames_of_two_sizes_are_refused() -> None:
 
 @pytest.mark.parametrize("name", standard_corruptions())
 def test_lowest_severity_changes_the_named_image(name: str) -> None:
-    data = CorruptedDataset(Recorded(), choose_corruption(name).ladder()[0], "test")
+    lowest = corruption_of(choose_corruption(name)).severities[0]
+    data = corrupted(Recorded(), name, lowest)
     clean, found = ([source.read(each) for each in NAMES] for source in (Recorded(), data))
     same_rgb, same_thermal = (
         all(np.array_equal(getattr(a, i), getattr(b, i)) for a, b in zip(clean, found, strict=True))
@@ -104,20 +106,30 @@ SMALL = ("corruption.block=16", "corruption.seed=3", "corruption.severities=[0.2
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "severity", "file_stem"),
+    ("name", "words", "typed", "severity", "shown", "changed"),
     [
-        ("occluded", (), "0.5", "occluded-0.5"),
-        ("occluded:rgb", SMALL, "0.25", "occluded_rgb-0.25_block-16_seed-3"),
-        ("removed:rgb", (), "", "rgb_removed-1"),
-        ("removed", ("corruption.image=rgb",), "", "rgb_removed-1"),
-        ("noise:thermal", ("corruption.image=rgb",), "8", "noise_rgb-8"),
-        ("noise", ("corruption.seed=0",), "8", "noise-8"),
+        ("occluded", (), "0.5", 0.5, "occluded", ()),
+        ("occluded:rgb", SMALL, "0.25", 0.25, "occluded_rgb_block-16_seed-3", ("block",)),
+        ("removed:rgb", (), "", 1, "rgb_removed", ()),
+        ("removed", ("corruption.image=rgb",), "", 1, "rgb_removed", ()),
+        ("noise:thermal", ("corruption.image=rgb",), "8", 8, "noise_rgb", ()),
+        ("noise", ("corruption.seed=0",), "8", 8, "noise", ()),
     ],
 )
-def test_file_stem_names_what_is_changed(
-    name: str, words: tuple[str, ...], severity: str, file_stem: str
+def test_name_and_severity_of_what_is_typed(
+    name: str,
+    words: tuple[str, ...],
+    typed: str,
+    severity: float,
+    shown: str,
+    changed: tuple[str, ...],
 ) -> None:
-    assert choose_corruption(name, words).at(severity).file_stem == file_stem
+    chosen = choose_corruption(name, words)
+    assert (chosen.name, severity_of(chosen, typed)) == (shown, severity)
+    assert chosen.changed == tuple(f"corruption.{key}" for key in changed)
+    # The ladder of severities changes no image of one severity.
+    assert chosen.settings.keys() >= {"corruption._target_", "corruption.seed"}
+    assert "corruption.severities" not in chosen.settings
 
 
 @pytest.mark.parametrize(
@@ -141,6 +153,9 @@ def test_file_may_name_corruptions_alone(
 def test_choose_corruptions() -> None:
     assert len(choose_corruptions("all", [])) == 14
     both = choose_corruptions("blur:rgb, frozen", ["corruption.seed=2"])
-    assert [(each.name, each.seed) for each in both] == [("blur_rgb", 2), ("frozen", 2)]
+    assert [(each.name, each.node["seed"]) for each in both] == [
+        ("blur_rgb_seed-2", 2),
+        ("frozen_seed-2", 2),
+    ]
     with pytest.raises(InputError, match=r"corruption\.block=8"):
         choose_corruptions("all", ["corruption.block=8"])

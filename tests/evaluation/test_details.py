@@ -14,8 +14,7 @@ from torch.nn import functional as F
 from rgbt.assembly.session import Session, open_session
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import Counted, evaluate, joined
+from rgbt.evaluation.measure import Counted, Measured, joined, measure, measurement_of
 from rgbt.metrics.details import DEFAULTS, KINDS, SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.named import value
 from rgbt.processes import collected, rank
@@ -53,27 +52,28 @@ class WithScenes(MFNet):
 
 
 def session_of(data: Path, kind: type[MFNet] = MFNet) -> Session:
+    """A session on the small data set whose network is a `Decoder`."""
     words = words_of(data, data / "runs", "+experiment=mfnet", "masker.patch_size=null")
     session = open_session(specify(compose(words)))
-    return replace(session, dataset=kind(data))
+    return replace(session, dataset=kind(data), model=Decoder())
 
 
-def request(*kinds: DetailKind, **others: object) -> EvaluationRequest:
-    return EvaluationRequest(
-        split="test", details=tuple(Details(each, DEFAULTS[each]) for each in kinds), **others
-    )
+def measured(session: Session, *kinds: DetailKind) -> Measured:
+    details = [Details(each, DEFAULTS[each]) for each in kinds]
+    return measure(session, measurement_of(session, "test"), details)
 
 
 def test_details_are_of_the_counted_pixels(data: Path) -> None:
     session = session_of(data, WithScenes)
-    plain = evaluate(session, Decoder(), request())
+    plain = measured(session)
     assert plain.details == {}
-    result = evaluate(session, Decoder(), request(*KINDS))
+    result = measured(session, *KINDS)
     assert np.array_equal(result.counts.counts, plain.counts.counts)
     assert tuple(result.details) == KINDS
     for kind, counts in result.details.items():
         assert counts.names == tuple(SPLITS["test"])
         assert counts.partition == Details(kind, DEFAULTS[kind]).partition("ring5")
+        assert counts.measurement.differences(plain.counts.measurement) == ("partition",)
     for kind in SCENE_KINDS:  # summed over bins
         counts = result.details[kind]
         bins = counts.counts.reshape(3, 5, -1, 9, 9)
@@ -87,7 +87,7 @@ def test_details_are_of_the_counted_pixels(data: Path) -> None:
 
 def test_calibration_counts_are_those_of_the_probabilities(data: Path) -> None:
     session = session_of(data)
-    result = evaluate(session, Decoder(), request("calibration"))
+    result = measured(session, "calibration")
     found = result.details["calibration"]
     confidence = float(torch.tensor([SURE] + [0.0] * 8).softmax(0)[0])  # e^3 / (e^3 + 8) = 0.715
     number, correct, units = found.counts.reshape(3, 5, 15, 3, 9).sum((0, 1, 4)).T
@@ -107,7 +107,7 @@ def _merged() -> tuple[list[str], dict[str, dict[DetailKind, np.ndarray]]]:
     own = NAMES[rank() :: 2]
     counted = {name: np.full((1, 2, 2), ord(name)) for name in own}
     detailed = {name: {"boundary": np.full((1, 3, 2), ord(name))} for name in own}
-    merged = joined(collected(Counted(counted, detailed, [], ())), NAMES)
+    merged = joined(collected(Counted(counted, detailed, [], [])), NAMES)
     return list(merged.counts), merged.details
 
 

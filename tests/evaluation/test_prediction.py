@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,13 +11,19 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from rgbt.assembly.session import open_session
 from rgbt.checks import InputError
+from rgbt.config.compose import compose
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
-from rgbt.evaluation.prediction import Predictor, heads_of, view_of
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.measure import measurement_of
+from rgbt.evaluation.predictor import Predictor, heads_of, view_of
 from rgbt.requirements import Record
+from rgbt.runs.specify import specify
 from rgbt.types import Batch, Output
+from tests.commands import ON_CPU
+from tests.data.layouts import PATTERNS, write_folder
+from tests.engine.test_evaluate import FABRIC, ROW, Ramp, grey
 
 
 class Network:
@@ -76,7 +83,7 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
     session: Any = session_of({"head": "day", "view": "rgb"}, target_is="night")
     session.model, session.autocast = Heads(), nullcontext
     session.prediction = Prediction()
-    predictor = Predictor(session, session.model, EvaluationRequest(split="test"))
+    predictor = Predictor(session)
     batch = Batch(
         rgb=torch.zeros(3, 3, 2, 2),
         thermal=torch.zeros(3, 1, 2, 2),
@@ -91,3 +98,42 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
     found = predictor.probabilities(batch)[:, 1, 0, 0].tolist()
     assert found == pytest.approx([0.269, 0.731, 0.269], abs=1e-3)
     assert not session.model.training
+
+
+def test_classes_and_confidences_agree_with_the_probabilities() -> None:
+    data = grey([ROW, ROW[::-1]], (4, 14))
+    session: Any = session_of({"head": None, "view": "rgb"})
+    session.model, session.autocast = Ramp(), FABRIC.autocast
+    session.model.record = Record(views=("rgb",))
+    session.prediction = Prediction(mirrored=True, window_hw=(2, 4), align_corners=True)
+    predictor = Predictor(session)
+    shares = predictor.probabilities(data)
+    classes, confidence = predictor.confident_classes(data)
+    assert classes.dtype == torch.uint8
+    assert torch.equal(classes.long(), shares.argmax(1))
+    torch.testing.assert_close(confidence, shares.amax(1))
+    assert torch.equal(predictor.classes(data), classes)
+    torch.testing.assert_close(shares.sum(1), torch.ones(1, 4, 14))
+
+
+OF_FOLDER = (
+    *(f"dataset.{key}='{text}'" for key, text in PATTERNS.items()),
+    *("dataset.num_classes=3", "dataset.classes=[background,person,car]", "model=mfnet_tiny"),
+    *("masker=none", "loss=cross_entropy", "data.num_workers=0", *ON_CPU),
+)
+
+
+def test_images_that_are_read_otherwise_are_another_measurement(tmp_path: Path) -> None:
+    """The range of the thermal values is a setting of the reader, which changes every image."""
+    root = write_folder(tmp_path / "data")
+    one, same, other = (
+        open_session(specify(compose([*OF_FOLDER, *words])))
+        for words in (
+            ("dataset=folder", f"dataset.root={root}", f"dataset.thermal_range=[20000,{highest}]")
+            for highest in (24000, 24000, 20100)
+        )
+    )
+    assert measurement_of(one, "test") == measurement_of(same, "test")
+    images = [each.dataset.read(each.dataset.names("test")[0]).thermal for each in (one, other)]
+    assert (images[0] != images[1]).any()
+    assert measurement_of(one, "test") != measurement_of(other, "test")

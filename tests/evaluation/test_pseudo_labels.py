@@ -20,12 +20,12 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
-from rgbt.engine.evaluate import probabilities
+from rgbt.engine.evaluate import label_scores, shares
 from rgbt.evaluation.images import labels_table, write_pseudo_labels
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.measure import measurement_of
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
-from rgbt.types import Output, View
+from rgbt.types import Batch, Output, View
 from tests.conftest import write_png
 
 NAMES = ("00001D", "00002N", "00003D")
@@ -93,7 +93,8 @@ def session_of(root: Path, *overrides: str) -> Session:
         *("masker=none", "loss=cross_entropy", "tracking=none", "data.num_workers=0"),
         *("trainer.accelerator=cpu", "trainer.threads=1", "data.eval_batch_size=2"),
     )
-    return replace(open_session(specify(compose([*words, *overrides]))), model=Fixed())
+    session = open_session(specify(compose([*words, *overrides])))
+    return replace(session, model=Fixed(), label="abc")
 
 
 @pytest.fixture
@@ -101,10 +102,11 @@ def session(root: Path) -> Session:
     return session_of(root)
 
 
-def written(session: Session, out: Path, threshold: float = 0.9, **others: Any) -> PseudoLabels:
-    mapped = {"label_map": others.pop("label_map", None)}
-    request = EvaluationRequest(**{"split": "train", "view": "thermal", **others})
-    return write_pseudo_labels(session, "abc", request, out, threshold=threshold, **mapped)
+def written(
+    session: Session, out: Path, threshold: float = 0.9, view: View = "thermal", **mapped: Any
+) -> PseudoLabels:
+    wanted = measurement_of(session, "train", view)
+    return write_pseudo_labels(session, wanted, out, threshold=threshold, **mapped)
 
 
 def image(path: Path) -> np.ndarray:
@@ -217,18 +219,22 @@ def test_images_that_cannot_be_read(root: Path, tmp_path: Path) -> None:
 def test_probabilities_at_the_size_of_the_label(session: Session) -> None:
     batches = eval_batches(session.dataset, "train", session.transform, session.loading)
     full = next(iter(batches)).to("cpu")
-    found = probabilities(session.model, full, session, "thermal")
+
+    def probabilities(model: nn.Module, batch: Batch, view: View = "rgbt") -> Tensor:
+        return shares(label_scores(model, batch, session, view), model)
+
+    found = probabilities(session.model, full, "thermal")
     assert (found.shape, found.dtype) == ((2, 9, *HW), torch.float32)
     assert torch.allclose(found.sum(1), torch.ones(2, *HW))
     # Images of half the label's size: scores are enlarged, then normalised.
     small = replace(full, rgb=full.rgb[..., ::2, ::2], thermal=full.thermal[..., ::2, ::2])
-    found = probabilities(session.model, small, session, "thermal")
+    found = probabilities(session.model, small, "thermal")
     scores = session.model(small.rgb, small.thermal, ("thermal",)).logits
     enlarged = nn.functional.interpolate(scores, HW, mode="bilinear", align_corners=False)
     expected = enlarged.exp() / enlarged.exp().sum(1, keepdim=True)
     assert torch.allclose(found, expected, atol=1e-6)
     # Masks of queries give shares.
-    found = probabilities(Constant([0.6, 0.2, 0.0], "masks"), full, session)
+    found = probabilities(Constant([0.6, 0.2, 0.0], "masks"), full)
     assert torch.allclose(found[1, :, 2, 3], torch.tensor([0.75, 0.25, 0.0]))
-    nothing = probabilities(Constant([0.0] * 3, "masks"), full, session)
+    nothing = probabilities(Constant([0.0] * 3, "masks"), full)
     assert nothing.max() == 0

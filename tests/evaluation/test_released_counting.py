@@ -16,13 +16,12 @@ from torch import Tensor, nn
 
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
-from rgbt.evaluation.prediction import Predictor
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import evaluate
+from rgbt.evaluation.measure import measure, measurement_of
+from rgbt.evaluation.predictor import Predictor
 from rgbt.types import Batch, Output
 from sweeps.table.table import load_table
 from tests.composed import specified
-from tests.evaluation.test_details import Decoder, session_of
+from tests.evaluation.test_details import session_of
 
 CLASSES = [[0, 8, 8, 2], [0, 8, 2, 2]]
 """What `Shows` predicts."""
@@ -45,7 +44,7 @@ def predictor(**settings: Any) -> Predictor:
     domains = Domains(source=source, target=None, target_is=None, tested_head="own")
     session: Any = SimpleNamespace(domains=domains, model=Shows(), autocast=nullcontext)
     session.prediction = Prediction(**settings)
-    return Predictor(session, session.model, EvaluationRequest(split="test"))
+    return Predictor(session)
 
 
 def batch(label: Any, dtype: torch.dtype = torch.uint8) -> Batch:
@@ -100,8 +99,8 @@ def test_evaluation_counts_pixels_of_the_smaller_image(data: Path, label_resize:
     small = replace(session.transform, test_short_edge=24)
     settings = Prediction(counted="image", label_resize=label_resize)  # type: ignore[arg-type]
     session = replace(session, transform=small, prediction=settings)
-    request = EvaluationRequest(split="test", keep=session.dataset.names("test"))
-    result = evaluate(session, Decoder(), request)
+    kept = session.dataset.names("test")
+    result = measure(session, measurement_of(session, "test"), keep=kept)
     interpolation = cv2.INTER_NEAREST if label_resize == "nearest" else cv2.INTER_LINEAR
     for name, counts in zip(result.counts.names, result.counts.counts, strict=True):
         sample = session.dataset.read(name)

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rgbt.evaluation.segmentation import result_tables
+from rgbt.evaluation.tables import result_tables
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from tests.measured import measurement
 
 
 def test_result_tables_of_two_regions_and_two_classes() -> None:
@@ -21,9 +22,7 @@ def test_result_tables_of_two_regions_and_two_classes() -> None:
         names=("1D", "2N"),
         night=(False, True),
         classes=("road", "car"),
-        partition="ring2",
-        dataset="x",
-        split="test",
+        measurement=measurement(partition="ring2"),
     )
     regions = Regions(partition="ring", regions=2, aspect="image", absent="released")
     tables = result_tables(counts, regions, "mine", step=7)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from math import cos, radians, sin
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,9 +20,14 @@ from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import NextFrames
+from rgbt.evaluation.measure import measurement_of
 from rgbt.evaluation.pair_frames import FlowRecord, Pairing, _record
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
+from rgbt.evaluation.temporal_consistency import (
+    Pairs,
+    consistency_table,
+    consistency_values,
+    count_pairs,
+)
 from rgbt.metrics.pairs import ca, tc
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
@@ -31,7 +37,6 @@ from tests.commands import SPLITS, words_of
 from tests.conftest import write_png
 
 HW = (48, 64)
-TEST = EvaluationRequest(split="test")
 VIRTUAL = Pairing("virtual")
 
 
@@ -68,6 +73,11 @@ class Oracle(nn.Module):
 def on_mfnet(data: Path, *overrides: str) -> Session:
     words = words_of(data, data / "runs", "+experiment=temporal_con", "masker.patch_size=null")
     return open_session(specify(compose([*words, *overrides])))
+
+
+def counted(session: Session, network: nn.Module, pairing: Pairing) -> Pairs:
+    session = replace(session, model=network)
+    return count_pairs(session, measurement_of(session, "test"), pairing)
 
 
 def source_of(triple: list[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +123,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
         write_png(data / "images" / f"{name}.png", image)
         write_png(data / "labels" / f"{name}.png", classes)
     session = on_mfnet(data)
-    found = count_pairs(session, Decoder(), TEST, VIRTUAL).counts
+    found = counted(session, Decoder(), VIRTUAL).counts
     sets = session.consistency
     for protocol in ("aligned", "released"):
         counts = found[protocol].counts.reshape(3, 3, 10, 9, 9)
@@ -136,7 +146,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
 
 def test_counts_of_neighbouring_scenes_are_kept_as_one(data: Path) -> None:
     whole, added = (
-        count_pairs(on_mfnet(data, *words), Decoder(), TEST, VIRTUAL).counts
+        counted(on_mfnet(data, *words), Decoder(), VIRTUAL).counts
         for words in ((), ("consistency.scenes_per_count=2",))
     )
     for protocol, counts in whole.items():
@@ -146,13 +156,13 @@ def test_counts_of_neighbouring_scenes_are_kept_as_one(data: Path) -> None:
 
 
 def test_unreadable_and_repeated_names_do_not_count(data: Path) -> None:
-    whole = count_pairs(on_mfnet(data), Decoder(), TEST, VIRTUAL).counts
+    whole = counted(on_mfnet(data), Decoder(), VIRTUAL).counts
     first, *others = SPLITS["test"]
     path = data / "images" / f"{first}.png"
     path.write_bytes(path.read_bytes()[:100])
     (data / "test.txt").write_text("\n".join([first, *others, others[0]]))
     session = on_mfnet(data, "data.on_error=skip", "scale.eval_batch_size=4")
-    for protocol, counts in count_pairs(session, Decoder(), TEST, VIRTUAL).counts.items():
+    for protocol, counts in counted(session, Decoder(), VIRTUAL).counts.items():
         assert counts.names == tuple(others)
         # The others keep the angles of their own places in the list.
         assert np.array_equal(counts.counts, whole[protocol].counts[1:])
@@ -180,8 +190,8 @@ def followed(session: Session, name: str, values: np.ndarray) -> tuple[np.ndarra
 
 def test_the_estimated_flow_is_counted_beside_the_exact_one(tmp_path: Path) -> None:
     session = on_synth(tmp_path)
-    exact = count_pairs(session, Decoder(), TEST, Pairing("next")).counts
-    found = count_pairs(session, Decoder(), TEST, Pairing("next", "both"))
+    exact = counted(session, Decoder(), Pairing("next")).counts
+    found = counted(session, Decoder(), Pairing("next", "both"))
     assert set(found.counts) == {"next", "flow"}
     assert np.array_equal(found.counts["next"].counts, exact["next"].counts)
     assert re.fullmatch("flow1-[0-9a-f]{6}", found.counts["flow"].partition)
@@ -223,7 +233,7 @@ def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
             one, two = (brought == cls) & seen, (second.label == cls) & seen
             agree[cls] += (one & two).sum()
             union[cls] += (one | two).sum()
-    found = count_pairs(session, oracle, TEST, Pairing("next")).counts["next"]
+    found = counted(session, oracle, Pairing("next")).counts["next"]
     assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
@@ -244,4 +254,4 @@ def test_second_frames_that_are_not_listed_are_refused(tmp_path: Path) -> None:
     session = on_synth(tmp_path, "scale.eval_batch_size=1")
     (session.dataset.root / "next" / "test.txt").write_text(session.dataset.names("test")[0])
     with pytest.raises(InputError):
-        count_pairs(session, Decoder(), TEST, Pairing("next"))
+        counted(session, Decoder(), Pairing("next"))

@@ -15,6 +15,7 @@ from rgbt.checks import InputError
 from rgbt.metrics import archive
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import Counts, check_same_means, convention
+from tests.measured import measurement, remeasured
 
 
 def example(night: tuple[bool, ...] | None = (False, True, True), **changes: Any) -> Counts:
@@ -24,17 +25,18 @@ def example(night: tuple[bool, ...] | None = (False, True, True), **changes: Any
         names=("00001D", "00002N", "00003N"),
         night=night,
         classes=("unlabeled", "car"),
-        partition="ring5",
-        dataset="abc",
-        split="test",
-        run="0123456789ab",
+        measurement=measurement(run="0123456789ab"),
     )
     return replace(counts, **changes)
 
 
 @pytest.mark.parametrize(
     "counts",
-    [example(), example(None), example(unscored=("car",), absent="exclude", run="")],
+    [
+        example(),
+        example(None),
+        example(unscored=("car",), measurement=measurement(absent="exclude", weights="f" * 64)),
+    ],
 )
 def test_what_is_saved_is_loaded(tmp_path: Path, counts: Counts) -> None:
     counts.save(tmp_path / "test.npz")
@@ -92,7 +94,7 @@ def test_counts_of_other_means_or_conventions_are_not_compared() -> None:
     check_same_means(example(unscored=("car",)), example(unscored=("car",)))
     with pytest.raises(InputError, match=r"leave out car .* leave out no class\. .*unscored"):
         check_same_means(example(unscored=("car",)), example())
-    both = [example(absent=absent) for absent in ("released", "exclude")]
+    both = [remeasured(example(), absent=absent) for absent in ("released", "exclude")]
     assert convention(both[1:]) == "exclude"
     with pytest.raises(InputError, match="Choose absent=released or absent=exclude"):
         convention(both)
@@ -114,7 +116,7 @@ def test_other_files_are_refused_and_nothing_in_them_runs(tmp_path: Path) -> Non
         with pytest.raises(InputError, match=f"not a readable file of counts.*{said}"):
             Counts.load(path)
     Archive("rgbt maps 1", "maps", "x").save(path, {})
-    with pytest.raises(InputError, match="expected the mark 'rgbt counts 2', got 'rgbt maps 1'"):
+    with pytest.raises(InputError, match="expected the mark 'rgbt counts 3', got 'rgbt maps 1'"):
         Counts.load(path)
     with pytest.raises(InputError, match="the file of counts .* does not exist"):
         Counts.load(tmp_path / "none.npz")

@@ -22,6 +22,7 @@ from rgbt.metrics.named import (
 )
 from rgbt.metrics.names import in_percent, shown
 from rgbt.metrics.score_grid import headlines, score_grid
+from tests.measured import measurement, remeasured
 from tests.sweeps.tabled import DAY, counts_of
 
 # Pairs of frames, by label, first, second.
@@ -37,7 +38,7 @@ OTHER = [[[0, 0], [0, 4]], [[0, 0], [0, 4]], [[0, 0], [0, 0]]]
 def pairs_of(night: tuple[bool, ...] | None = (False, True), partition: str = "aligned2") -> Counts:
     """Two sets: by day each once, by night the first one twice."""
     counts = counts_of([*ONE, *OTHER], [*ONE, *ONE], night=night)
-    return replace(counts, partition=partition, names=("a", "b"))
+    return remeasured(replace(counts, names=("a", "b")), partition=partition)
 
 
 # Details, of an image by day and one by night.
@@ -51,9 +52,7 @@ def of_details(kind: Any, setting: tuple[float, ...], *images: object) -> Counts
         names=tuple(map(str, range(len(images)))),
         night=tuple(index % 2 == 1 for index in range(len(images))),
         classes=("road", "car"),
-        partition=Details(kind, setting).partition("ring2"),
-        dataset="d",
-        split="test",
+        measurement=measurement(partition=Details(kind, setting).partition("ring2")),
     )
 
 

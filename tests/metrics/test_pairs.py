@@ -98,8 +98,6 @@ def test_the_protocol_is_read_from_the_partition() -> None:
         for views in ("", "1c0ffe"):
             assert pairs.protocol_of(pairs.partition_name(protocol, 3, views)) == protocol
     assert pairs.partition_name("next", 1, "1c0ffe") == "next1-1c0ffe"
-    assert pairs.file_name("next", "val") == "evaluations/consistency_next_val.npz"
-    assert pairs.file_name("next", "val", "ab") == "evaluations/consistency_next-ab_val.npz"
     for partition in ("ring5", "ring9_released_3_4", "vertical3", "aligned", ""):
         assert pairs.protocol_of(partition) is None
 

@@ -11,6 +11,7 @@ import pytest
 from rgbt.metrics import scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from tests.measured import measurement
 from tests.models.golden import FOLDER
 
 GOLDEN = FOLDER / "losses.npz"
@@ -120,9 +121,7 @@ def counts_of(*regions: object) -> Counts:
         names=("0",),
         night=None,
         classes=CLASSES,
-        partition=f"ring{len(regions)}",
-        dataset="f",
-        split="test",
+        measurement=measurement(partition=f"ring{len(regions)}"),
         unscored=("void",),
     )
 

@@ -7,6 +7,7 @@ because those of a GPU give other numbers.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,8 +16,7 @@ from torch import Tensor
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.data.loaders import eval_batches
-from rgbt.evaluation.prediction import Predictor
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.predictor import Predictor
 from rgbt.randomness import torch_generator
 from rgbt.runs.specify import specify
 from rgbt.types import MaskPair
@@ -66,8 +66,8 @@ def one_step(setup: TrainingSetup, loaded: Any) -> tuple[float, float]:
 
 def classes(setup: TrainingSetup) -> list[Tensor]:
     """Classes of every pixel of the test split, on the CPU, of the network as it was drawn."""
-    session = setup.session
-    predictor = Predictor(session, setup.model, EvaluationRequest(split="test"))
+    session = replace(setup.session, model=setup.model)
+    predictor = Predictor(session)
     batches = eval_batches(session.dataset, "test", session.transform, session.loading)
     return [predictor.classes(batch.to(session.device)).cpu() for batch in batches]
 

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import (
     Description,
     RunFolder,
-    counts_name,
     find_run,
     is_finished,
     read_description,
@@ -37,6 +35,7 @@ from rgbt.runs.folder import (
 from rgbt.runs.result import RunResult
 from rgbt.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking.sync import Options, folders_of
+from tests.measured import measurement, store
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
@@ -197,9 +196,10 @@ def test_small_files_come_back(tmp_path: Path) -> None:
 
 
 def counts(dataset: str = "d", split: str = "test") -> Counts:
-    data: Any = {"dataset": dataset, "split": split, "names": ("a",), "night": None}
     matrix = np.ones((1, 1, 2, 2), np.int64)
-    return Counts(counts=matrix, classes=("road", "car"), partition="ring1", **data)
+    of = measurement(dataset=dataset, split=split, partition="ring1")
+    names, classes = ("a",), ("road", "car")
+    return Counts(counts=matrix, names=names, night=None, classes=classes, measurement=of)
 
 
 @pytest.fixture
@@ -208,7 +208,7 @@ def run(tmp_path: Path) -> RunResult:
     folder.describe(Description("a name", {"rgbt.group": "grbm", "rgbt.seed": "3"}, {"k": "v"}))
     folder.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": True, "diff": ""})
     folder.add_provenance({"git_commit": "f" * 16, "diff": ""})
-    counts().save(folder.path / counts_name("test"))
+    store(folder.path, counts())
     assert not is_finished(folder.path)
     scores = {"mIoU": 0.25, "Var": 2.5, "region/1": None}
     folder.finish(
@@ -228,18 +228,30 @@ def test_run_result_reads_what_the_run_wrote(run: RunResult) -> None:
     assert not unfinished.folder.exists(), "reading makes no folder"
 
 
-def test_has_counts_wants_test_counts_of_this_training(run: RunResult) -> None:
-    counts("other").save(run.folder / "other.npz")
-    counts(split="val").save(run.folder / "val.npz")
-    (run.folder / "damaged.npz").write_text("no archive")
-    files = ("counts_test.npz", "none.npz", "other.npz", "val.npz", "damaged.npz")
-    assert [name for name in files if run.has_counts(name)] == ["counts_test.npz"]
-    other = [name for name in files if run.has_counts(name, other_dataset=True)]
-    assert other == ["counts_test.npz", "other.npz"]
-    (run.folder / "best.pt").touch()
-    written = (run.folder / "best.pt").stat().st_mtime
-    os.utime(run.folder / "counts_test.npz", (written - 9, written - 9))
-    assert not run.has_counts("counts_test.npz")
+def test_measurements_are_those_of_all_files_of_counts(
+    run: RunResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store(run.folder, counts(split="val"))
+    store(run.folder, counts(), view="thermal")
+    store(run.folder, counts(), dataset="0123456789", dataset_name="kp")
+    counts().save(run.folder / "a_copy.npz")
+    (run.folder / "evaluations/damaged.npz").write_text("no archive")
+    found = {path: (of.split, of.view, of.dataset) for path, of in run.measurements().items()}
+    assert found == {
+        "counts_test.npz": ("test", "rgbt", "d"),
+        "counts_val.npz": ("val", "rgbt", "d"),
+        "evaluations/test_thermal.npz": ("test", "thermal", "d"),
+        "evaluations/test_kp-01234567.npz": ("test", "rgbt", "0123456789"),
+    }
+    assert capsys.readouterr().err.count("damaged.npz is left out") == 1
+    for path, of in run.measurements().items():
+        assert run.counts(path).measurement == of
+
+
+def test_counts_of_another_run_are_refused(run: RunResult) -> None:
+    path = store(run.folder, counts(), view="thermal", run="0123456789ab")
+    with pytest.raises(InputError, match="has counts of the run 0123456789ab, not of abc"):
+        run.counts(f"evaluations/{path.name}")
 
 
 TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -16,9 +16,12 @@ import sqlalchemy
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
+from sweeps.evaluation import Words, measurement_of
 from sweeps.point import Point
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space import build_sampler, parse_space
@@ -30,6 +33,7 @@ from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
 from sweeps.worker.storage import STALE_S, TrialStore, open_storage, open_study
 from sweeps.worker.trial_sources import SamplerSource
+from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 180.0
@@ -104,7 +108,19 @@ def counts(right: int = 3, dataset: str = DATASET) -> Counts:
     """One image of one region and two classes."""
     array = np.array([[[[right, 4 - right], [0, 4]]]])
     named = {"names": ("00001D",), "night": None, "classes": ("road", "car")}
-    return Counts(counts=array, **named, partition="ring1", dataset=dataset, split="test")
+    return Counts(
+        counts=array, **named, measurement=measurement(partition="ring1", dataset=dataset)
+    )
+
+
+def measure(folder: Path, words: Words, right: int = 2) -> None:
+    """Write the counts of a measurement of a finished run, as its command does."""
+    made, found = counts(right), measurement_of(words, RunResult(folder).counts().measurement)
+    rows = number_of_regions(found.partition) or 3  # of pairs: a label of two classes, or none
+    array = np.repeat(made.counts, rows, axis=1)
+    path = folder / "evaluations" / f"{' '.join(words)}.npz"
+    path.parent.mkdir(exist_ok=True)
+    replace(made, counts=array, measurement=found).save(path)
 
 
 def finish(

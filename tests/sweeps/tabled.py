@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from sweeps.evaluation import ExtraEvaluation
+from rgbt.metrics.measurement import Measurement
+from rgbt.runs.result import OWN
+from sweeps.evaluation import Words, measurement_of
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import OWN_COUNTS, CellId, ScoredTable, score
+from sweeps.table.cells import CellId, ScoredTable, score
 from sweeps.table.table import Column, Row, Table
+from tests.measured import measurement
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
@@ -28,9 +31,7 @@ def counts_of(*images: Any, night: tuple[bool, ...] | None = (False, True)) -> C
         names=tuple(f"{index:05d}" for index in range(len(array))),
         night=night,
         classes=("road", "car"),
-        partition="ring2",
-        dataset="d",
-        split="test",
+        measurement=measurement(partition="ring2", dataset="d"),
     )
 
 
@@ -52,18 +53,34 @@ class FakeResult:
     lists: str = ""
     machine: str = ""
 
-    def counts(self, path: str = OWN_COUNTS) -> Counts:
+    def measurements(self) -> dict[str, Measurement]:
+        return {path: counts.measurement for path, counts in self.by_path.items()}
+
+    def counts(self, path: str = OWN) -> Counts:
         return self.by_path[path]
+
+
+def measured(counts: Counts, words: Words, own: Counts) -> Counts:
+    """Counts as those of the measurement `words` of the run that ended with `own`."""
+    found = measurement_of(words, own.measurement)
+    if found.dataset_words:  # the data set that they make has another fingerprint
+        found = replace(found, dataset="another", changed=("dataset",))
+    return replace(counts, measurement=found)
 
 
 def outcome(
     key: str,
-    made: Counts | Mapping[ExtraEvaluation | None, Counts],
+    made: Counts | Mapping[Words, Counts],
     commit: str | None = "aaaaaaaaaa",
 ) -> Outcome:
     """A finished run."""
-    every = {None: made} if isinstance(made, Counts) else made
-    by_path = {OWN_COUNTS if each is None else each.path: counts for each, counts in every.items()}
+    every = {(): made} if isinstance(made, Counts) else made
+    by_path = {
+        f"evaluations/{' '.join(words)}.npz": measured(counts, words, every[()])
+        for words, counts in every.items()
+        if words
+    }
+    by_path |= {OWN: every[()]}
     result: Any = FakeResult(key, by_path, commit)
     return Outcome(Point(key, ()), "finished", results=(result,))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from sweeps.reproduce import entry as reproduce
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.worker.planner import Planner
 from tests.commands import Call, assert_one_sentence
+from tests.measured import remeasured
 from tests.sweeps.verdicts.accuracies import accuracy
 
 TABLE = """\
@@ -57,7 +57,7 @@ def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
             own = {"rgbt.experiment": "baseline", "rgbt.seed": str(seed), **(tags or {})}
             described = {"name": run.key, "tags": own, "params": {}}
             write_json(folder / "run.json", described)
-            replace(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
+            remeasured(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
             result = {"key": run.key, "dataset": dataset, "test": {"mIoU": share / 100}}
             write_json(folder / "result.json", result)
 

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from rgbt.config.options import types_of
+from rgbt.runs.result import OWN
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import Options, entry, settings_of
 from sweeps.settings import SweepSettings
-from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
 from tests.commands import Call, assert_one_sentence
@@ -62,7 +62,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
 
 
 def _outcome(point: Point, state: str, index: int) -> Outcome:
-    found: Any = FakeResult(f"k{index}", {OWN_COUNTS: right(40 + index)})
+    found: Any = FakeResult(f"k{index}", {OWN: right(40 + index)})
     if state == "finished":
         return Outcome(point, "finished", results=(found,), keys=(f"k{index}",))
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]

@@ -21,6 +21,7 @@ from tests.analysis.figures.framed import write_framed
 from tests.analysis.robust_runs import SCORES, write_levels
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call
+from tests.measured import remeasured
 
 NAMES = [f"{index:05d}{'DN'[index % 2]}" for index in range(12)]
 
@@ -250,7 +251,7 @@ def test_methods_on_other_images_are_not_shown_together(
     other.mkdir()
     for path in (made / "b").glob("counts_*.npz"):
         counts = Counts.load(path)
-        replace(counts.select(counts.names[:-1]), split="val").save(other / path.name)
+        remeasured(counts.select(counts.names[:-1]), split="val").save(other / path.name)
     words = [word.replace(f"B:{made / 'b'}", f"B:{other}") for word in arguments(figure, made)]
     code, _, err = call(entry, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
     assert code == 2

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.figures.inputs import check_same_images
 from analysis.figures.scores import (
     class_consistency,
     corrupted,
@@ -19,13 +20,14 @@ from analysis.figures.scores import (
     map_of,
     region_means,
 )
-from analysis.results import Training, levels_of
+from analysis.results import Training, trainings
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from tests.analysis.counts import counts_of
 from tests.analysis.figures.drawn import letters, strips, texts
 from tests.analysis.robust_runs import SCORES, less, write_levels
+from tests.measured import differing
 
 FAST = Resampling(resamples=200, blocks="none")
 
@@ -109,6 +111,17 @@ def test_intervals_cover_images_and_seeds(seeds: int, covers: str) -> None:
     assert (frame["seeds"][0], frame["images"][0]) == (seeds, 40)
 
 
+def test_methods_that_are_measured_differently_are_a_remark(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    every = [method(), differing(method(1), view="thermal"), method(2)]
+    assert check_same_images(every) is every[0]
+    assert "is measured differently (view: rgbt, thermal)" in capsys.readouterr().err
+    check_same_images(every, alike=False)
+    check_same_images([method(), method(1)])
+    assert capsys.readouterr().err == ""
+
+
 def test_partitions_by_name() -> None:
     for name, regions in (("ring5", strips(5, "ring")), ("vertical4", strips(4))):
         np.testing.assert_array_equal(map_of(name, (48, 64)), regions.map((48, 64)))
@@ -145,18 +158,18 @@ def test_profiles_say_what_their_intervals_cover(tmp_path: Path, number: int) ->
 @pytest.fixture
 def training(tmp_path: Path) -> object:
     def made(name: str, scores: dict) -> Training:
-        folder = write_levels(tmp_path / name, scores)
-        return Training(name, levels_of(folder))
+        (found,) = trainings(str(write_levels(tmp_path / name, scores)))
+        return found
 
     return made
 
 
 @pytest.fixture
 def methods(training) -> dict[str, list[Training]]:
-    without_features = {key: each for key, each in less(20).items() if "features" not in key[0]}
+    two_images = {key: each for key, each in less(20).items() if key[0] != "thermal"}
     return {
         "CRM": [training("a", SCORES), training("b", less(10))],
-        "RTFNet": [training("c", without_features)],
+        "RTFNet": [training("c", two_images)],
     }
 
 

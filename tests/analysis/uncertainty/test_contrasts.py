@@ -19,6 +19,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.randomness import numpy_generator
 from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
+from tests.measured import remeasured
 
 SETTINGS = Resampling(resamples=120, blocks="none")
 METRICS = ("mIoU", "Var", "region/2", "class/car", "class/person/region/1", "pixel_accuracy")
@@ -120,7 +121,7 @@ def test_evidence_terms_may_have_other_regions() -> None:
     """The same predictions in one region and in two have the same mIoU on every draw."""
     row, _ = rows_of()
     whole = {
-        seed: replace(each, counts=each.counts.sum(1, keepdims=True), partition="ring1")
+        seed: remeasured(replace(each, counts=each.counts.sum(1, keepdims=True)), partition="ring1")
         for seed, each in row.items()
     }
     found = Resampler(SETTINGS).evidence([term(1.0, row, "two"), term(-1.0, whole, "one")])

@@ -195,7 +195,7 @@ def test_counts_of_other_things_are_refused(changed: dict[str, Any], word: str) 
     a, b = pair(Population())
     a = [replace(a[0], night=tuple(n % 2 == 0 for n in range(60)))]
     with pytest.raises(InputError, match=word):
-        compare(a, [replace(b[0], **changed)], ["mIoU"], SETTINGS)
+        compare(a, [counts_of(b[0].counts, **changed)], ["mIoU"], SETTINGS)
 
 
 def test_other_labels_and_too_few_images_are_refused() -> None:

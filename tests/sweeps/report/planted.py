@@ -18,6 +18,7 @@ from sweeps.table.table import load_table
 from sweeps.table_plan import make_request, row_digests
 from sweeps.worker.planner import Planner
 from tests.analysis.counts import result_of
+from tests.measured import remeasured
 from tests.sweeps.verdicts.accuracies import accuracy
 
 PROVENANCE = {
@@ -38,7 +39,7 @@ def with_rings(counts: Counts) -> Counts:
     """Counts of two regions as those of five rings, of which three have no pixel."""
     empty = np.zeros_like(counts.counts, shape=(len(counts.names), 3, *counts.counts.shape[2:]))
     both = np.concatenate([counts.counts, empty], 1)
-    return replace(counts, counts=both, partition="ring5")
+    return remeasured(replace(counts, counts=both), partition="ring5")
 
 
 def plant(
@@ -61,7 +62,7 @@ def plant(
             folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
             folder.add_provenance(PROVENANCE)
             counts = with_rings(accuracy(percent, zlib.crc32(str(seed).encode()) % 97))
-            counts = replace(counts, dataset="data", run=spec.key)
+            counts = remeasured(counts, dataset="data", run=spec.key)
             counts.save(folder.path / "counts_test.npz")
             result = {"name": spec.name, **result_of(spec.key, counts)}
             folder.finish({**result, "seconds_of_last_process": 60.0 + seed})

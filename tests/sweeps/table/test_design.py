@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.config.values import check_value
+from sweeps.evaluation import command_of
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part, cell_name
 from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
@@ -83,12 +84,13 @@ def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> 
     by_label = {point.label: point for point in request.points()}
     assert by_label["crm N-T- seed=0"].evaluations == ()
     worlds = by_label["crm natural seed=0"].evaluations
-    assert [each.world for each in worlds] == ["N-T-", "N-T+", "N+T-", "N+T+"]
-    assert worlds[1].command == (
-        *("rgbt.evaluate", "modality=default", "regions=as trained"),
-        *("dataset.rgb_noise=0.0", "dataset.texture_strength=2.0"),
-    )
-    assert len({each.path for each in worlds}) == 4
+    assert worlds == tuple(table.rows[9].tested_in.values())
+    assert worlds[1] == ("dataset.rgb_noise=0.0", "dataset.texture_strength=2.0")
+    assert command_of(worlds[1]) == ("rgbt.evaluate", *worlds[1])
+    assert len(set(worlds)) == 4
+    ring = replace(request, table=replace(table, regions="ring9"))
+    (point,) = (each for each in ring.points() if each.label == "crm natural seed=0")
+    assert point.evaluations[2:] == tuple(("regions=ring9", *words) for words in worlds[1:])
 
 
 def design(generators: dict[str, str], letters: str = "OCNS") -> Design:

@@ -17,6 +17,7 @@ from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
+from sweeps.evaluation import counts_of, stored_at
 from sweeps.point import Outcome
 from sweeps.table import external
 from sweeps.table.cells import score
@@ -155,13 +156,16 @@ def test_predictions_have_the_counts_of_rgbt_score(
     shape = (f"regions={file[-1]}", "resamples=0")
     assert call(score_command.entry, *words, *shape, f"out={tmp_path / 'out'}")[0] == 0
     expected = Counts.load(tmp_path / "out" / f"counts_{file}.npz")
-    own = regions == "as trained"
-    found = result.counts("counts_test.npz" if own else f"evaluations/table_default_{regions}.npz")
+    cut = () if regions == "as trained" else (f"regions={regions}",)
+    found = counts_of(result, cut)
     assert np.array_equal(found.counts, expected.counts)
     assert (found.dataset, found.partition) == (expected.dataset, file)
-    other = f"evaluations/table_default_{regions.replace(' ', '-')}_rgb_removed.npz"
-    assert set(run["CMNeXt"].missing) == {other, "evaluations/consistency_aligned_test.npz"}
-    assert [command[0] for command in commands] == ["analysis.score"]
+    assert run["CMNeXt"].missing == {
+        (*cut, "corruption=removed:rgb"): external.NEEDS_NETWORK,
+        ("frames=aligned",): external.NEEDS_PAIRS,
+    }
+    # Plain images first, with which others are compared.
+    assert [command[0] for command in commands] == ["analysis.score"] * (1 + len(cut))
 
 
 def test_weights_have_the_counts_of_their_training_run(
@@ -172,16 +176,16 @@ def test_weights_have_the_counts_of_their_training_run(
     (found,), expected = outcome.results, RunResult(run).counts()
     assert np.array_equal(found.counts().counts, expected.counts)
     assert found.counts().dataset == expected.dataset
-    without = found.counts("evaluations/table_default_as-trained_rgb_removed.npz")
+    without = counts_of(found, ("corruption=removed:rgb",))
     assert not np.array_equal(without.counts, expected.counts)
     assert without.partition == expected.partition == "ring5"
-    pairs = found.counts("evaluations/consistency_aligned_test.npz")
+    pairs = counts_of(found, ("frames=aligned",))
     scored = score("my/1", TABLE, {("MFNet", 0): outcome}, scale="demo")
     mean = 100 * tc(pairs.by_region(), "released").mean()
     assert scored.cells["MFNet", "TC"].mean == pytest.approx(mean)
     assert scored.cells["MFNet", "no RGB"].reason == ""
-    assert found.folder.joinpath("evaluations/consistency_released_test.npz").is_file()
-    assert len(commands) == 3  # both protocols in one call
+    assert stored_at(found, ("frames=released",)), "both protocols in one call"
+    assert len(commands) == 3
     assert all("trust=my_lab" in command for command in commands)
 
 
@@ -196,8 +200,9 @@ def test_predictions_of_exported_pairs_have_a_consistency(
     shutil.copy(pairs / "pairs.json", folder)
     (found,) = runs_of(f"predictions.CMNeXt={folder}")["CMNeXt"].results
     (network,) = runs_of(f"weights.MFNet={run / 'best.pt'}")["MFNet"].results
-    for path in ("counts_test.npz", "evaluations/consistency_aligned_test.npz"):
-        assert np.array_equal(found.counts(path).counts, network.counts(path).counts)
+    for words in ((), ("frames=aligned",)):
+        mine, theirs = (counts_of(each, words).counts for each in (found, network))
+        assert np.array_equal(mine, theirs)
 
 
 def test_counts_are_made_once_unless_content_changes(

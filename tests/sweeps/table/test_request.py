@@ -7,7 +7,6 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import available, compose
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest, seeds_of
@@ -56,7 +55,7 @@ def test_points_share_runs_of_equal_rows() -> None:
         "rgbt.requested/own/t": "released ''",
     }
     assert points[0].seeds == ()
-    assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
+    assert points[0].evaluations == (("modality=thermal",),)
 
 
 def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
@@ -64,12 +63,12 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         *(Column(name="mIoU", metric="mIoU"), Column(name="TC", metric="TC", frames="released")),
         Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
     )
-    for regions, others in (("as trained", ()), ("ring9", (ExtraEvaluation(regions="ring9"),))):
+    for regions, others in (("as trained", ()), ("ring9", (("regions=ring9",),))):
         asked = TableRequest("own/t", table(ROWS, columns, regions=regions), "demo", (0,))
         assert asked.points()[0].evaluations == (
             *others,
-            ExtraEvaluation(frames="released"),
-            ExtraEvaluation(frames="aligned"),
+            ("frames=released",),
+            ("frames=aligned",),
         )
 
 

@@ -10,10 +10,11 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from sweeps.evaluation import ExtraEvaluation
+from rgbt.runs.result import OWN
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import OWN_COUNTS, ScoredTable, TableCell, published, score, size_marks
+from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
 from sweeps.table.table import Column, Row
+from tests.measured import measurement, remeasured
 from tests.sweeps.tabled import FakeResult, Made, counts_of, failed, outcome, right, table
 
 ACC = Column(name="acc", metric="pixel_accuracy")
@@ -21,7 +22,7 @@ RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
 LESS = Column(name="less", minus=("rgb", "acc"))
 ROW = (Row(label="a", experiment="crm"),)
 BOTH = {
-    ("a", seed): outcome(str(seed), {None: right(acc), ExtraEvaluation("rgb"): right(rgb)})
+    ("a", seed): outcome(str(seed), {(): right(acc), ("modality=rgb",): right(rgb)})
     for seed, (acc, rgb) in enumerate([(50, 40), (70, 50)])
 }
 """Two seeds: accuracy of 50 and 70 percent, of RGB alone 40 and 50."""
@@ -64,7 +65,7 @@ def test_score_omitted_rows_and_columns_have_no_cell() -> None:
         *(Row(label="a", without=("rgb",)), Row(label="b")),
         Row(label="theirs", values={"acc": 3.0, "rgb": None}),
     )
-    both = {None: right(50), ExtraEvaluation("rgb"): right(30)}
+    both = {(): right(50), ("modality=rgb",): right(30)}
     runs = {("a", 0): outcome("k", right(40)), ("b", 0): outcome("l", both)}
     mean = Column(name="both", mean=("acc", "rgb"))
     found = scored((ACC, RGB, LESS, mean), runs, rows)
@@ -82,7 +83,7 @@ def test_score_omitted_rows_and_columns_have_no_cell() -> None:
 def details_of(partition: str, *rows: list[list[int]]) -> Counts:
     """Details of one image."""
     like = counts_of(night=None).select(["00000"])
-    return replace(like, counts=np.array([rows]), partition=partition)
+    return replace(like, counts=np.array([rows]), measurement=measurement(partition=partition))
 
 
 def test_score_details_have_own_counts() -> None:
@@ -94,12 +95,12 @@ def test_score_details_have_own_counts() -> None:
     # Road: both 2 of 4 and 3 boundary pixels; car: 1 of 1 and 1.
     edge = details_of("ring1-boundary-0.02", [[2, 1], [4, 1], [3, 1]])
     # 10 pixels, of which 7 are right with a confidence of 0.9 on average.
-    bins = [[0, 0]] * 3, [[10, 0], [7, 0], [90_000, 0]]
-    ece = details_of("ring1-calibration-2", *bins)
+    bins = *[[[0, 0]] * 3] * 14, [[10, 0], [7, 0], [90_000, 0]]
+    ece = details_of("ring1-calibration-15", *bins)
     made = {
-        None: right(50),
-        ExtraEvaluation("rgb", details="boundary"): edge,
-        ExtraEvaluation(details="calibration"): ece,
+        (): remeasured(right(50), partition="ring1"),
+        ("modality=rgb", "details=boundary"): edge,
+        ("details=calibration",): ece,
     }
     rows = tuple(Row(label=name, settings={"class": name}) for name in ("road", "car"))
     run = outcome("k", made)
@@ -136,7 +137,7 @@ def test_score_failed_seed_keeps_reason() -> None:
 
 
 class Uncounted(FakeResult):
-    def counts(self, path: str = OWN_COUNTS) -> Counts:
+    def counts(self, path: str = OWN) -> Counts:
         raise InputError(f"{self.folder}/{path} does not exist")
 
 
@@ -144,7 +145,7 @@ def test_runs_without_counts_share_a_reason() -> None:
     every: Any = [Uncounted(key, {}, folder=Path(key)) for key in "kl"]
     points = [Outcome(Point(each.key, ()), "finished", results=(each,)) for each in every]
     cell = scored((ACC,), {("a", seed): each for seed, each in enumerate(points)}).cells["a", "acc"]
-    assert cell.reason == f"seeds 0, 1: {OWN_COUNTS} does not exist"
+    assert cell.reason == f"seeds 0, 1: {OWN} does not exist"
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", math.nan)])
@@ -154,6 +155,6 @@ def test_score_absent_class_follows_table(absent: Any, wanted: float) -> None:
     found = scored((column,), {("a", 0): outcome("k", right(100))}, absent=absent)
     assert found.cells["a", "mIoU"].mean == pytest.approx(wanted, nan_ok=True)
     # Without a convention of its own the table takes that of the counts.
-    counted = {("a", 0): outcome("k", replace(right(100), absent=absent))}
+    counted = {("a", 0): outcome("k", remeasured(right(100), absent=absent))}
     mean = scored((column,), counted).cells["a", "mIoU"].mean
     assert mean == pytest.approx(wanted, nan_ok=True)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rgbt.metrics.counts import Counts
-from sweeps.table.cells import world_evaluations
+from sweeps.table.cells import world_words
 from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
@@ -154,11 +154,11 @@ def test_claim_is_about_one_part_of_a_design() -> None:
 
 def test_networks_tested_in_worlds_use_counts_of_each() -> None:
     table = design_table(trained=None, tested=Part())
-    worlds = world_evaluations(table, table.rows[0])
+    worlds = world_words(table, table.rows[0])
     assert list(worlds) == list(CELLS)
     runs = {}
     for seed in (0, 1):
-        made: dict[Any, Counts] = {None: with_rates(0.5, 0.5)}
+        made: dict[Any, Counts] = {(): with_rates(0.5, 0.5)}
         made |= {worlds[cell]: with_rates(rate, 0.9) for cell, rate in RATES.items()}
         runs["baseline natural", seed] = outcome(f"run{seed}", made)
     found = estimates(table, runs)

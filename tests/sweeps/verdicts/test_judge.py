@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
 from sweeps.point import Outcome
-from sweeps.table.cells import OWN_COUNTS, CellId, TableCell, score
+from sweeps.table.cells import CellId, TableCell, score
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, as_claimed
@@ -206,16 +205,15 @@ def test_rows_of_different_lists_or_machines_are_said() -> None:
     )
 
 
-def test_seeds_without_the_evaluation_do_not_count(tmp_path: Path) -> None:
-    """Another table may have trained seed 2 of a row, without the evaluation of this one."""
-    runs = planted({"low": SHARES["low"], "high": SHARES["high"]})
-    for (label, seed), each in runs.items():
-        folder = tmp_path / f"{label}{seed}"
-        folder.mkdir()
-        if seed < 2:
-            (folder / OWN_COUNTS).touch()
-        run = replace(each.results[0], folder=folder)  # type: ignore[type-var]
-        runs[label, seed] = replace(each, results=(run,))
-    found = judge(claim(rows=("high",), against=("low",)), runs).verdict
+def test_seeds_without_the_evaluation_do_not_count() -> None:
+    """Another table may have trained seed 2 of a row, without the measurement of this one."""
+    one, runs = claim(rows=("high",), against=("low",)), {}
+    for label, shares in SHARES.items():
+        for seed, share in enumerate(shares):
+            own, of_rgb = accuracy(50.0, seed), accuracy(share, seed)
+            made = {(): own, ("modality=rgb",): of_rgb} if seed < 2 else own
+            runs[label, seed] = outcome(f"{label}{seed}", made)
+    rgb = replace(of(one), columns=(Column(**{**vars(ACC), "modality": "rgb"}),))
+    found = TableJudge("own/t", rgb, resamples=200).judge(one, runs).verdict  # type: ignore[arg-type]
     assert found is not None
-    assert found.seeds == 2
+    assert (found.seeds, round(found.estimate)) == (2, 10)

@@ -11,7 +11,6 @@ import pytest
 
 from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.settings import Objective
 from sweeps.worker import driver as drivers
 from tests.sweeps.fakes import (
@@ -110,7 +109,7 @@ def test_driver_timeout_starts_next_trial(tmp_path: Path) -> None:
 
 
 def test_driver_gives_processes_tags_gpu_and_trust(tmp_path: Path) -> None:
-    ring = ExtraEvaluation(regions="ring9")
+    ring = ("regions=ring9",)
     tagged = points(2, tags={"rgbt.table/one": "row"}, evaluations=(ring,))
     desk = list_desk(tmp_path, tagged, workers=2, gpus=(3, 5), trust="my_lab").run()
     trusting = ["trust=my_lab" in call.words for call in desk.executor.calls]

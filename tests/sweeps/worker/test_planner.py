@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.runs.specify import specify
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.worker.planner import Planner
 
@@ -40,11 +38,11 @@ def test_plan_uses_run_key_of_command(planner: Planner, base: tuple[str, ...]) -
 
 
 EVALUATIONS = (
-    ExtraEvaluation("thermal", "ring9"),
-    ExtraEvaluation(frames="aligned"),
-    ExtraEvaluation(corruption="noise", severity=8),
-    ExtraEvaluation(corruption="noise:rgb", severity=8),
-    ExtraEvaluation(head="own"),
+    ("modality=thermal", "regions=ring9"),
+    ("frames=aligned",),
+    ("corruption=noise", "severity=8"),
+    ("corruption=noise:rgb", "severity=8"),
+    ("head=own",),
 )
 
 
@@ -54,7 +52,7 @@ def test_plan_key_hashes_runs_and_evaluations(planner: Planner) -> None:
     assert [run.key for run in plan.runs] == runs
     keys = {planner.plan(Point("p", (), evaluations=(each,))).key for each in EVALUATIONS}
     assert len({*runs, plan.key, *keys}) == 3 + len(EVALUATIONS)
-    same = planner.plan(Point("q", (), evaluations=(replace(EVALUATIONS[0]),))).key
+    same = planner.plan(Point("q", (), evaluations=((*EVALUATIONS[0],),))).key
     assert same in keys
 
 

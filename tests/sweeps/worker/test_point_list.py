@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome, Point
 from sweeps.worker import driver as drivers
 from sweeps.worker.planner import PlannedPoint
@@ -40,6 +38,7 @@ from tests.sweeps.fakes import (
     FakePlanner,
     finish,
     list_desk,
+    measure,
     memory,
     plan_of,
     points,
@@ -97,7 +96,7 @@ def test_untrusted_class_is_refused_before_training(
             return replace(planned, runs=tuple(runs))
 
     (tmp_path / "my_lab.py").write_text("class Loss: ...\n")
-    given = (Point("a", ("x=1",)), Point("b", ("x=2",), evaluations=(ExtraEvaluation(),)))
+    given = (Point("a", ("x=1",)), Point("b", ("x=2",), evaluations=(("modality=rgb",),)))
     wanted = replace(a_list(tmp_path), points=given, planner=OwnLoss())  # type: ignore[arg-type]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
@@ -176,18 +175,18 @@ def test_failed_point_that_was_run_by_hand_is_finished(tmp_path: Path) -> None:
 
 
 def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
-    ring = ExtraEvaluation(regions="ring9")
-    plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring,)))
+    ring, rgb = ("regions=ring9",), ("modality=rgb",)
+    plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring, rgb)))
     runs = RunStore(tmp_path, NoTracking())
     for run in plan.runs:
         assert finished_runs(plan, runs) == ()
         finish(tmp_path / run.key)
     both = finished_runs(plan, runs)
     assert [found.key for found in both] == [run.key for run in plan.runs]
-    assert not is_evaluated(plan, both)
     for found in both:
-        (found.folder / "evaluations").mkdir()
-        shutil.copyfile(found.folder / "counts_test.npz", found.folder / ring.path)
+        for words in (ring, rgb):
+            assert not is_evaluated(plan, both)
+            measure(found.folder, words)
     assert is_evaluated(plan, both)
     finish(tmp_path / plan.runs[0].key, dataset="another")
     assert finished_runs(plan, runs) == ()

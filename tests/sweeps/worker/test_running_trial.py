@@ -13,7 +13,7 @@ from rgbt.files.atomic import holding
 from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.evaluation import ExtraEvaluation
+from sweeps.evaluation import Words, counts_of
 from sweeps.point import Point
 from sweeps.worker import running_trial as works
 from sweeps.worker.planner import PlannedPoint
@@ -32,11 +32,11 @@ from tests.sweeps.fakes import (
     Call,
     FakeExecutor,
     Process,
-    counts,
     fail,
     finish,
     hang,
     leave,
+    measure,
     plan_of,
     scored,
     succeed,
@@ -46,12 +46,8 @@ from tests.sweeps.fakes import (
 POINT = Point("p", ("x=1",))
 PLAN = plan_of(POINT)
 KEY = PLAN.key
-RING = ExtraEvaluation("thermal", "ring9")
-ALIGNED, RELEASED, NEXT = (
-    ExtraEvaluation(frames="aligned"),
-    ExtraEvaluation(frames="released"),
-    ExtraEvaluation(frames="next"),
-)
+RGB, RING = ("modality=rgb",), ("modality=thermal", "regions=ring9")
+ALIGNED, RELEASED, NEXT = ((f"frames={each}",) for each in ("aligned", "released", "next"))
 
 
 class Bench:
@@ -228,38 +224,39 @@ def evaluating(call: Call) -> Process:
     if call.module == "rgbt.run":
         return (yield from succeed(call))
     yield
-    if call.module == "rgbt.evaluate":
-        files = [Path(call.value("out"))]
-    else:
-        made = {"virtual": (ALIGNED, RELEASED), "next": (NEXT,)}[call.value("frames")]
-        files = [Path(call.value("run")) / evaluation.path for evaluation in made]
-    for file in files:
-        file.parent.mkdir(exist_ok=True)
-        counts(right=2).save(file)
+    others = ("run=", "trust=", "dataset.root=")
+    made: list[Words] = [tuple(word for word in call.words if not word.startswith(others))]
+    if call.module == "rgbt.consistency":
+        made = [NEXT] if call.value("frames") == "next" else [ALIGNED, RELEASED]
+    for words in made:
+        measure(Path(call.value("run")), words)
     return 0
 
 
 def test_running_trial_evaluates_finished_run(tmp_path: Path) -> None:
-    plan = evaluated(evaluations=(ExtraEvaluation(), RING, RELEASED, ALIGNED, NEXT))
+    plan = evaluated(evaluations=(RGB, RING, RELEASED, ALIGNED, NEXT))
     bench = Bench(tmp_path, plan, evaluating, trust="my_lab")
     (found,) = bench.run()
     run, own, root = f"run={found.folder}", "trust=my_lab", "dataset.root=/x"
-    outs = [f"out={found.folder / each.path}" for each in (ExtraEvaluation(), RING)]
     assert [(call.module, *call.words) for call in bench.executor.calls[1:]] == [
-        ("rgbt.evaluate", run, "modality=default", "regions=as trained", outs[0], own, root),
-        ("rgbt.evaluate", run, "modality=thermal", "regions=ring9", outs[1], own, root),
-        ("rgbt.consistency", run, "frames=virtual", f"runs_dir={tmp_path}", own, root),
-        ("rgbt.consistency", run, "frames=next", f"runs_dir={tmp_path}", own, root),
+        ("rgbt.evaluate", run, "modality=rgb", own, root),
+        ("rgbt.evaluate", run, "modality=thermal", "regions=ring9", own, root),
+        ("rgbt.consistency", run, "frames=virtual", own, root),
+        ("rgbt.consistency", run, "frames=next", own, root),
     ]
-    for evaluation in plan.point.evaluations:
-        assert found.counts(evaluation.path).counts[0, 0, 0, 0] == 2
+    for words in plan.point.evaluations:
+        assert counts_of(found, words).counts[0, 0, 0, 0] == 2
+    assert found.counts().counts[0, 0, 0, 0] == 3
     assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
 
 
 def test_running_trial_failed_evaluation_fails_trial(tmp_path: Path) -> None:
     plan = evaluated(evaluations=(RING,))
     finish(tmp_path / plan.runs[0].key)
-    for behaviour, reason in ((fail, "a bad day"), (leave(0), RING.path)):
+    for behaviour, reason in (
+        (fail, "a bad day"),
+        (leave(0), f"it wrote no counts of {' '.join(RING)}"),
+    ):
         with pytest.raises(TrialError, match=reason):
             Bench(tmp_path, plan, behaviour).run()
 
