@@ -41,8 +41,8 @@ if TYPE_CHECKING:  # few commands map classes
 
 CHECKPOINTS = ("best", "last")
 
-# Settings of a data set that say where its files are.
-FOLDERS = ("dataset.root=", "dataset.cache_dir=")
+# Settings of a data set that say where its files are, or how counts are scored.
+UNCHANGED = tuple(f"dataset.{key}=" for key in ("root", "cache_dir", "absent", "unscored"))
 
 
 def trusted_settings(
@@ -157,10 +157,11 @@ def open_run(
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     session = with_weights(spec, folder, checkpoint, trained_with, label_map)
-    if "dataset" in session.changed:
-        words = [word for word in overrides if word.lstrip("+").startswith("dataset")]
-        words = [word for word in words if not word.startswith(FOLDERS)]
-        session = replace(session, dataset_words=tuple(words))
+    typed = [word for word in overrides if word.startswith("dataset")]
+    words = tuple(word for word in typed if not word.startswith(UNCHANGED))
+    if "dataset" in session.changed or any(word.startswith("dataset.") for word in words):
+        changed = dict.fromkeys((*session.changed, "dataset"))
+        session = replace(session, dataset_words=words, changed=tuple(changed))
     counts = sorted(folder.glob("counts_*.npz"))
     if counts and label_map is None:
         _check_classes(session, Counts.load(counts[0]).classes, folder)

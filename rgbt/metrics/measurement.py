@@ -49,7 +49,8 @@ class Measurement:
             nobody knows a network.
         checkpoint: of a run, "best" or "last".
         step: the optimiser step of the weights; 0 where none is known.
-        dataset: fingerprint of the data set.
+        dataset: fingerprint of the data set; `dataset_words` are the overrides that were typed for
+            another one than that of the run.
         split: of the data set.
         view: the images that the network gets: "rgbt", "rgb" or "thermal".
         head: of a network with one per domain: "own", "source" or "target"; else "".
@@ -64,8 +65,7 @@ class Measurement:
 
         absent: how a class without pixels scores (`rgbt.metrics.scores`), which is no count.
         changed: fields and keys of settings that differ from the test that the run ends with.
-        dataset_name: of the data set, in names of files; `dataset_words` are the overrides that
-            were typed for another one than that of the run.
+        dataset_name: of the data set, in names of files.
         corruption: name in files and tables: "noise_rgb", "occluded_block-16"; "" for none.
         title: of the corruption for people: "noise, RGB", and `unit` that of its severity.
     """
@@ -75,6 +75,7 @@ class Measurement:
     checkpoint: str = "best"
     step: int = 0
     dataset: str
+    dataset_words: tuple[str, ...] = ()
     split: str
     view: str = ""
     head: str = ""
@@ -86,7 +87,6 @@ class Measurement:
     absent: Absent = field(default="released", compare=False)
     changed: tuple[str, ...] = field(default=(), compare=False)
     dataset_name: str = field(default="", compare=False)
-    dataset_words: tuple[str, ...] = field(default=(), compare=False)
     corruption: str = field(default="", compare=False)
     title: str = field(default="", compare=False)
     unit: str = field(default="", compare=False)
@@ -185,7 +185,8 @@ class Measurement:
             words.append(f"{word}-{self.severity:g}" if is_corruption else word)
         if settings:
             words.append("_".join(word.rpartition(".")[2] for word in settings)[:LENGTH])
-        if any("." in key for key in self.changed):  # whose values the words may not tell apart
+        # Values of settings, and other words for equal images, which the name may not tell apart.
+        if self.dataset_words or any("." in key for key in self.changed):
             words.append(self.digest[:8])
         return "_".join(re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in words) + ".npz"
 
