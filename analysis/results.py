@@ -331,6 +331,9 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
     if len(chosen) != 1:
         said = ", ".join(each.said for each in known) or "none"
         what = f"condition={condition}" if condition else f"frames={frames}"
+        if chosen:
+            files = ", ".join(each.path.name for each in chosen)
+            raise InputError(f"{what} names {files} in {run.folder}; name one of these files.")
         raise InputError(
             f"{what} is not counted in {run.folder}, which has {said} of split '{split}'; rgbt "
             "consistency, robustness and evaluate make counts."
@@ -370,24 +373,31 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
     return found
 
 
+def row_of(level: Evaluation) -> str:
+    """The corruption, or the single input, of a level; "clean"."""
+    of = level.counts.measurement
+    return of.corruption or (of.view if "view" in of.changed else CLEAN)
+
+
 def levels_of(every: Sequence[Evaluation], folder: Path) -> tuple[Evaluation, ...]:
     """Clean images first, then single inputs, then corruptions by title and severity.
 
     InputError: `folder` has none of these, or not both.
     """
-    found = []
-    for each in every:
-        changed = {key.partition(".")[0] for key in each.counts.measurement.changed}
-        if changed <= {"view", "severity", "corruption"}:
-            found.append(each)
-    is_clean = [each.condition == CLEAN for each in found]
+    changed = [{k.partition(".")[0] for k in e.counts.measurement.changed} for e in every]
+    # What was changed for all of them, such as the size of the images, is no condition.
+    allowed = {"view", "severity", "corruption"}.union(
+        set.intersection(*changed) if changed else ()
+    )
+    found = [each for each, keys in zip(every, changed, strict=True) if keys <= allowed]
+    is_clean = [row_of(each) == CLEAN for each in found]
     if all(is_clean) or not any(is_clean):
         what = "corrupted" if any(is_clean) else "clean"
         raise InputError(f"{folder} has no counts of {what} images; rgbt robustness makes them.")
 
     def order(each: Evaluation) -> tuple[bool, bool, str, str, float]:
         of = each.counts.measurement
-        title = of.title or of.label
-        return each.condition != CLEAN, of.unit != "", title, each.condition, of.severity
+        row = row_of(each)
+        return row != CLEAN, of.unit != "", of.title or of.label, row, of.severity
 
     return tuple(sorted(found, key=order))

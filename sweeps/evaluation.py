@@ -13,7 +13,7 @@ from rgbt.config.compose import compose
 from rgbt.config.corruption_node import choose_corruption
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import DEFAULTS, SCENE_KINDS, Details
-from rgbt.metrics.measurement import Measurement, settings_of
+from rgbt.metrics.measurement import Measurement, dataset_words, settings_of
 from rgbt.metrics.pairs import protocol_of
 from rgbt.runs.result import OWN, RunResult
 
@@ -49,10 +49,13 @@ def stored_at(result: RunResult, words: Words) -> str | None:
     if not words:
         return OWN
     known = result.measurements()
-    if not known:
+    base = known.get(OWN)
+    if base is None and words[0].startswith("frames="):
+        # Pairs of frames may be all that there is of weights or predictions.
+        base = next((each for each in known.values() if not each.run), None)
+    if base is None:
         return None
-    # Pairs of frames may be all that there is of weights or predictions.
-    wanted = measurement_of(words, known.get(OWN, next(iter(known.values()))))
+    wanted = measurement_of(words, base)
     return next((path for path, found in known.items() if _is_same(found, wanted)), None)
 
 
@@ -60,7 +63,7 @@ def counts_of(result: RunResult, words: Words) -> Counts:
     """The counts of a measurement of a finished run; InputError: there are none, or damaged."""
     path = stored_at(result, words)
     if path is None:
-        shown = " ".join(words[:3]) + (f" and {len(words) - 3} more" if len(words) > 3 else "")
+        shown = "this world" if dataset_words(words) else " ".join(words)
         raise InputError(f"there are no counts of {shown}; evaluate the run to write them.")
     return result.counts(path)
 
@@ -87,8 +90,8 @@ def measurement_of(words: Words, base: Measurement) -> Measurement:
     if head := options.get("head"):
         found["head"] = head
     if statistics := options.get("batch_norm"):
-        splits = options.get("batch_norm_splits", "")
-        found |= {"statistics": statistics, "statistics_of": tuple(filter(None, splits.split(",")))}
+        splits = dict.fromkeys(filter(None, options.get("batch_norm_splits", "").split(",")))
+        found |= {"statistics": statistics, "statistics_of": tuple(splits)}
     if name := options.get("corruption"):
         chosen = choose_corruption(name)
         severity = float(options.get("severity", chosen.node["severities"][0]))
@@ -102,7 +105,7 @@ def measurement_of(words: Words, base: Measurement) -> Measurement:
         found["partition"] = Details(details, DEFAULTS[details]).partition(found["partition"])
     if protocol := options.get("frames"):
         found["partition"] = f"{protocol}0"
-    if overrides := tuple(word for word in words if word.startswith("dataset")):
+    if overrides := dataset_words(words):
         found |= {"dataset_words": overrides, "dataset": ""}
     return replace(base, **found)
 

@@ -177,7 +177,7 @@ def test_consistency_on_another_motion_replaces_no_counts(
     assert "TC next" in measure(call, *where, "dataset.ego_forward_m=0.5")
     (path,) = place.glob("*.npz")
     counts, before = Counts.load(path), path.read_bytes()
-    assert re.fullmatch(r"test_next1-[0-9a-f]{6}_synth-[0-9a-f]{8}\.npz", path.name)
+    assert re.fullmatch(r"test_next1-[0-9a-f]{6}_synth-[0-9a-f]{8}_[0-9a-f]{8}\.npz", path.name)
     assert re.fullmatch("next1-[0-9a-f]{6}", counts.partition)
     assert counts.counts.shape == (3, 10, 9, 9)
     assert 0.5 * 3 * 48 * 64 < counts.counts.sum() < 3 * 48 * 64  # what both frames show

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from analysis import compare
+from analysis.results import evaluations_of
 from rgbt import evaluate, robustness
+from rgbt.config.compose import conf_dir
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.runs.result import RunResult
@@ -175,3 +178,43 @@ def test_heads_are_told_apart(call: Call, trained: Trained, tmp_path: Path) -> N
     )
     assert first.unlike(second) == ("head: own, source",)
     assert second.file_name == "test_source-head.npz"
+
+
+@pytest.mark.slow
+def test_counts_of_an_earlier_step_are_no_counts_of_the_finished_run(call: Call, run: Path) -> None:
+    path, _ = evaluated(call, run, "modality=thermal")
+    counts = Counts.load(path)
+    stale = replace(counts, measurement=replace(counts.measurement, step=1))
+    stale.save(path)
+    assert path.relative_to(run).as_posix() not in RunResult(run).measurements()
+    assert "thermal" not in {each.condition for each in evaluations_of(RunResult(run))}
+    again, out = evaluated(call, run, "modality=thermal")
+    assert again == path
+    assert "measured before" not in out
+    assert Counts.load(path).measurement == counts.measurement
+
+
+@pytest.mark.slow
+def test_a_run_is_scored_in_one_way(call: Call, run: Path) -> None:
+    """Whoever measured first with another rule does not decide how tables score."""
+    path, _ = evaluated(call, run, "modality=thermal metric.absent=exclude")
+    assert Counts.load(path).absent == "exclude"
+    name = path.relative_to(run).as_posix()
+    assert RunResult(run).counts(name).absent == RunResult(run).counts().absent == "released"
+
+
+@pytest.mark.slow
+def test_files_of_equal_names_are_other_corruptions(call: Call, run: Path, tmp_path: Path) -> None:
+    text = (conf_dir() / "corruption" / "occluded.yaml").read_text()
+    own = tmp_path / "own" / "occluded.yaml"
+    own.parent.mkdir()
+    own.write_text(text.replace("block: 32", "block: 16"))
+    first, _ = evaluated(call, run, "corruption=occluded severity=0.5")
+    second, _ = evaluated(call, run, f"corruption={own} severity=0.5")
+    named = [Counts.load(path).measurement for path in (first, second)]
+    assert named[0].unlike(named[1]) == ("corruption.block: 32, 16",)
+    assert named[0].condition == "occluded"
+    assert named[1].condition.startswith("occluded-")
+    same, out = evaluated(call, run, "corruption=occluded severity=0.5 corruption.block=32")
+    assert same == first
+    assert "measured before" in out

@@ -197,8 +197,6 @@ RUN_REFUSALS = {
         [
             *(("frames=nxt", "'frames'"), ("frames=next", "has no second frames")),
             ("consistency=none", "consistency.sets is empty"),
-            ("transform.test_short_edge=96", "out="),
-            ("trainer.precision=bf16-mixed", "changes how the run is measured"),
             ("consistency.sets=[released_4]", "'released_3'"),
             ("camera@consistency.view.camera=no", "there is no camera 'no'"),
             ("scheme.view.mode=rotation", "scheme.view.mode"),
@@ -207,10 +205,7 @@ RUN_REFUSALS = {
     robustness.entry: (
         CRM,
         [
-            *(
-                ("corruptions=blurr", "'blur'"),
-                ("metric.absent=exclude", "how the run is measured"),
-            ),
+            ("corruptions=blurr", "'blur'"),
             ("run=a,b out=x", "out="),
         ],
     ),

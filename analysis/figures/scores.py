@@ -22,7 +22,7 @@ from analysis.figures.inputs import (
     check_same_images,
     figure,
 )
-from analysis.results import Training, trainings
+from analysis.results import Training, row_of, trainings
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.corruption_node import row_name
@@ -158,7 +158,8 @@ def corrupted(
     for method, number, level in levels:
         score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
         of = level.counts.measurement
-        about = of.condition, of.title or of.label or CLEAN, of.unit, of.severity
+        row = row_of(level)
+        about = row, of.title or (CLEAN if row == CLEAN else of.label), of.unit, of.severity
         cells.append((*about, method, number, float(score)))
     names_ = ["row", "title", "unit", "severity", "method", "training", "mIoU"]
     every = pd.DataFrame(cells, columns=names_)
@@ -185,7 +186,10 @@ def corrupted(
         relative_sd=("relative", "std"),
     )
     # Points at which only some trainings of a method were measured are not shown.
-    return found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
+    found = found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
+    if found.empty:
+        raise InputError("runs: there is no corruption that all trainings were measured under.")
+    return found
 
 
 @plots.styled

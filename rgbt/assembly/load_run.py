@@ -30,6 +30,7 @@ from rgbt.engine.checkpoint import check_origin, load_checkpoint, restore_weight
 from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.measurement import dataset_words
 from rgbt.runs.folder import find_run, read_marker, read_provenance
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.source_code import code_of
@@ -40,9 +41,6 @@ if TYPE_CHECKING:  # few commands map classes
     from rgbt.data.label_map import LabelMap
 
 CHECKPOINTS = ("best", "last")
-
-# Settings of a data set that say where its files are, or how counts are scored.
-UNCHANGED = tuple(f"dataset.{key}=" for key in ("root", "cache_dir", "absent", "unscored"))
 
 
 def trusted_settings(
@@ -157,8 +155,7 @@ def open_run(
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     session = with_weights(spec, folder, checkpoint, trained_with, label_map)
-    typed = [word for word in overrides if word.startswith("dataset")]
-    words = tuple(word for word in typed if not word.startswith(UNCHANGED))
+    words = dataset_words(overrides)
     if "dataset" in session.changed or any(word.startswith("dataset.") for word in words):
         changed = dict.fromkeys((*session.changed, "dataset"))
         session = replace(session, dataset_words=words, changed=tuple(changed))
@@ -219,7 +216,8 @@ def _changed(
 
 def _typed(session: Session, overrides: Sequence[str]) -> tuple[str, ...]:
     """The settings of a network that is no run which were typed; see `Session.changed`."""
-    words = [word.lstrip("+").partition("=")[0] for word in overrides]
+    every = (word.lstrip("+").partition("=")[0] for word in overrides)
+    words = [word for word in every if word != "dataset"]  # its images say what it is
     read = reader_settings(session.dataset)
     known = sorted(measured_settings(session.spec.plain) | read)
     changed = [key for key in known if any(f"{key}.".startswith(f"{word}.") for word in words)]

@@ -7,6 +7,8 @@ setting, ``corruption.seed=1`` what is drawn.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -88,7 +90,8 @@ def choose_corruption(
         check_choice(NODE, stem, corruption_files())
     path = Path(name).expanduser() if is_file else corruption_files()[stem]
     typed = [*([f"image={image}"] if image else []), *(w.removeprefix(f"{NODE}.") for w in words)]
-    config = OmegaConf.create({NODE: load_config(path, trust, NODE)})
+    stored = load_config(path, trust, NODE)
+    config = OmegaConf.create({NODE: stored})
     for key, _, value in (word.partition("=") for word in typed):
         OmegaConf.update(config, f"{NODE}.{key}", parse_yaml(value, f"{NODE}.{key}"))
     # A missing image is refused where the corruption is built.
@@ -97,12 +100,17 @@ def choose_corruption(
     first = path.stem if is_file else row_name(f"{stem}:{node.get('image', '')}")
     # The image is part of the name of a shipped file, and a change of a user's file.
     unnamed = ("severities", "seed") if is_file else ("severities", "seed", "image")
-    changes = [word for word in typed if word.partition("=")[0] not in unnamed]
+    changes = []
+    for word in typed:
+        key = word.partition("=")[0]
+        is_changed = OmegaConf.select(config, f"{NODE}.{key}") != OmegaConf.select(stored, key)
+        changes += [word] if key not in unnamed and is_changed else []
     drawn = [f"seed={node['seed']}"] if node["seed"] else []
     shown = "_".join(re.sub(r"[^\w.]+", "-", word) for word in (first, *changes, *drawn))
     found = ChosenCorruption(shown, node)
-    if is_file:
-        return found._replace(changed=tuple(found.settings))
+    if is_file:  # files of one name may differ
+        digest = hashlib.sha256(json.dumps(found.settings, sort_keys=True).encode()).hexdigest()[:6]
+        return ChosenCorruption(f"{shown}-{digest}", node, tuple(found.settings))
     keys = [f"{NODE}.{word.partition('=')[0]}" for word in changes]
     return found._replace(changed=tuple(keys))
 
@@ -115,7 +123,8 @@ def choose_corruptions(
     others = [word for word in words if not word.startswith(f"{NODE}.seed=")]
     if others and len(names) > 1:
         raise InputError(f"'{others[0]}' is a setting of one corruption; corruptions={text}.")
-    return [choose_corruption(name, words, trust) for name in dict.fromkeys(names)]
+    every = [choose_corruption(name, words, trust) for name in names]
+    return list({each.name: each for each in every}.values())
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[list[str], list[str]]:

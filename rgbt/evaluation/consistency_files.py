@@ -30,12 +30,14 @@ def write_pairs(
 
     InputError: a file holds another measurement, which is not replaced.
     """
+    new = {}
     for protocol, counts in pairs.counts.items():
-        check_replaceable(paths[protocol], counts.measurement)
         _check_same_predictions(paths[protocol], counts)
-    for protocol, counts in pairs.counts.items():
-        paths[protocol].parent.mkdir(parents=True, exist_ok=True)
-        counts.save(paths[protocol])
+        if not check_replaceable(paths[protocol], counts.measurement):
+            new[paths[protocol]] = counts
+    for file, counts in new.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        counts.save(file)
     lines = [(f"counts, {protocol}", str(paths[protocol])) for protocol in pairs.counts]
     # Named like the counts that it shows, those of the first protocol.
     first = paths[next(iter(pairs.counts))]

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from rgbt.files.plain_files import parse_json
 from rgbt.metrics.metric import Absent
+from rgbt.types import VIEWS
 
 # Statistics of batch normalisation (`rgbt.evaluation.batch_norm`): of the training, of all images,
 # of the images by day and of the night apart, of each batch.
@@ -34,6 +36,11 @@ TITLES = {
 }
 
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that no text has
+
+# Settings of a data set that say where its files are, or how counts are scored.
+SAME_DATASET = tuple(f"dataset.{key}=" for key in ("root", "cache_dir", "absent", "unscored"))
+
+HEADS = ("", "own", "source", "target")
 
 # Characters of the changed settings in a file name.
 LENGTH = 60
@@ -92,8 +99,14 @@ class Measurement:
     unit: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
-        if self.absent not in get_args(Absent):
-            raise ValueError(f"absent: expected released or exclude, got '{self.absent}'.")
+        known = {"absent": get_args(Absent), "view": ("", *VIEWS), "head": HEADS}
+        for key, words in known.items():
+            if (found := getattr(self, key)) not in words:
+                raise ValueError(
+                    f"{key}: expected {', '.join(filter(None, words))}, got '{found}'."
+                )
+        if not math.isfinite(self.severity):
+            raise ValueError(f"severity: expected a number, got {self.severity}.")
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -115,14 +128,18 @@ class Measurement:
         """What differs between two measurements beside their networks, in words: "view: rgb, rgbt".
 
         Of one network that is every difference. Of two networks it is what differs from the test
-        that each ends with: as it is trained, each may see other images at another size.
+        that each ends with: as it is trained, each may see its images at another size.
         """
         mine, others = self._values(), other._values()
         is_same = (self.run, self.weights) == (other.run, other.weights)
+        named = {*self.changed, *other.changed, "dataset"}
+        if {self.statistics, other.statistics} != {"as trained"}:
+            named |= {"statistics_of", "data.eval_batch_size"}
         found = []
         for key in self.differences(other):
-            is_changed = key in (*self.changed, *other.changed) or key.startswith("corruption.")
-            if key not in ("run", "weights", "step", "settings") and (is_same or is_changed):
+            is_named = is_same or key in named or key.startswith("corruption.")
+            is_network = key in ("run", "weights", "settings") or (key == "step" and not is_same)
+            if is_named and not is_network:
                 found.append(f"{key}: {_shown(mine.get(key))}, {_shown(others.get(key))}")
         return tuple(found)
 
@@ -182,7 +199,7 @@ class Measurement:
         settings = [f"{key}={value}" for key, value in self._changed_settings().items()]
         for word in self.words[: len(self.words) - len(settings)]:
             is_corruption = self.unit and word == self.corruption
-            words.append(f"{word}-{self.severity:g}" if is_corruption else word)
+            words.append(f"{word}-{self.severity:.15g}" if is_corruption else word)
         if settings:
             words.append("_".join(word.rpartition(".")[2] for word in settings)[:LENGTH])
         # Values of settings, and other words for equal images, which the name may not tell apart.
@@ -215,6 +232,12 @@ class Measurement:
         if any(CONTROL.search(each) for each in texts):
             raise ValueError("a text of the measurement has control characters")
         return found
+
+
+def dataset_words(overrides: Iterable[str]) -> tuple[str, ...]:
+    """The overrides that make a data set another one: not where it lies, nor how it is scored."""
+    typed = (word for word in overrides if word.startswith("dataset"))
+    return tuple(word for word in typed if not word.startswith(SAME_DATASET))
 
 
 def _shown(value: Any) -> str:

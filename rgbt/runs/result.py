@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,15 @@ OWN = "counts_test.npz"
 def _measurement(path: Path, _changed: int, _size: int) -> Measurement:
     """What a file is of; tables ask again and again."""
     return read_measurement(path)
+
+
+def _check_step(step: int, best: int) -> None:
+    """InputError: the checkpoint was another one when this was measured."""
+    if step != best:
+        raise InputError(f"it is of step {step}, but the best is of step {best}; measure it again.")
+
+
+_warn_once = lru_cache(warn)  # what is polled would fill the log
 
 
 @dataclass(frozen=True)
@@ -150,23 +159,40 @@ class RunResult:
         if path.is_file() or split.endswith(".npz"):
             counts = Counts.load(path)
             self._check_fits(counts, path)
-            return counts
+            return self._scored(counts, path)
         how = "rerun the command of the run to finish it"
         if self.is_finished:
             how = f"write them with: rgbt evaluate run={self.folder} split={split}"
         raise InputError(f"{self.folder} has no counts of the split '{split}'; {how}.")
 
     def measurements(self) -> dict[str, Measurement]:
-        """Files of counts inside the folder, and what they are of; a damaged one with a warning."""
-        found = {}
+        """Files of counts inside the folder, and what they are of.
+
+        A damaged one, or one of an earlier step than that of the finished run, is left out with a
+        warning.
+        """
+        found, result = {}, read_result(self.folder) or {}
         for path in sorted(path for pattern in COUNTS for path in self.folder.glob(pattern)):
             try:
                 file = path.stat()
                 known = _measurement(path, file.st_mtime_ns, file.st_size)
+                if (known.run, known.checkpoint) == (self.key, "best"):
+                    _check_step(known.step, result.get("best_step", known.step))
                 found[path.relative_to(self.folder).as_posix()] = known
             except InputError as error:
-                warn(f"{path} is left out: {error}")
+                _warn_once(f"{path} is left out: {error}")
         return found
+
+    def _scored(self, counts: Counts, path: Path) -> Counts:
+        """The counts with the scored classes and the rule for absent ones of the run's own test."""
+        own = self.folder / OWN
+        if path == own or not own.is_file():
+            return counts
+        first = Counts.load(own)
+        if first.classes != counts.classes:
+            return counts
+        measurement = replace(counts.measurement, absent=first.absent)
+        return replace(counts, unscored=first.unscored, measurement=measurement)
 
     def _check_fits(self, counts: Counts, path: Path) -> None:
         """InputError: counts of another run, or not of the labels that its own counts are of."""

@@ -137,7 +137,7 @@ def test_counts_are_found_by_what_they_are_of(tmp_path: Path) -> None:
     assert stored_at(run, ()) == OWN
     assert stored_at(run, ("modality=rgbt", "regions=ring5")) == OWN
     assert stored_at(run, ("modality=thermal",)) == "evaluations/d.npz"
-    assert counts_of(run, ("modality=thermal",)).absent == "exclude"
+    assert counts_of(run, ("modality=thermal",)).absent == BASE.absent, "as the run is scored"
     for words in (("modality=rgb",), ("modality=thermal", "regions=ring9")):
         assert stored_at(run, words) is None
         with pytest.raises(InputError, match=f"no counts of {' '.join(words)}; evaluate"):
