@@ -66,7 +66,7 @@ def overview(opened: Session, files: Mapping[Path, Counts], note: str = "") -> G
         lines.append((details.kind, str(file)))
     tables = result_tables(counts, opened.regions, label, opened.step)
     return Group(
-        result_view(tables, path.parent, [line for line in lines if line[1]]),
+        result_view(tables, opened.folder, [line for line in lines if line[1]]),
         *(rich_table(_details_table(each, label)) for _, each in others),
     )
 
