@@ -8,9 +8,11 @@ from typing import Any
 
 import pytest
 
+from rgbt import evaluate
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import read_provenance, runs_in
+from rgbt.runs.result import RunResult
 from tests.commands import Call, Trained, only_run, short, train
 
 
@@ -44,7 +46,10 @@ def test_fresh_retrains_runs_of_other_code_and_keeps_them(
     assert code == 0, err
     kept = runs / "replaced" / f"{folder.name}-1"
     assert f"open it with run={kept}" in err
-    assert (kept / "best.pt").is_file()
+    assert RunResult(kept).counts().names == before.names
+    code, out, err = call(evaluate.entry, f"run={kept}", "modality=thermal")
+    assert code == 0, err
+    assert str(kept / "evaluations" / "test_thermal.npz") in out
     assert [run.path for run in runs_in(runs)] == [folder]
     assert (Counts.load(folder / "counts_test.npz").counts == before.counts).all()
     assert "fresh: false" in (folder / "config.yaml").read_text()

@@ -31,7 +31,7 @@ from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import dataset_words
-from rgbt.runs.folder import find_run, read_marker, read_provenance
+from rgbt.runs.folder import find_run, read_marker, read_provenance, run_key
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.source_code import code_of
 from rgbt.runs.specify import CHECKOUT, load_spec, specify
@@ -183,7 +183,7 @@ def with_weights(
         raise InputError(f"{folder} has no {weights.name}; rerun its command to resume it.")
     check_links(folder)
     payload = load_checkpoint(weights)
-    check_origin(payload, weights, folder.name, settings_digest(trained_with))
+    check_origin(payload, weights, run_key(folder), settings_digest(trained_with))
     session = open_session(spec, label_map, load_weights=False)
     restore_weights(session.model, payload["model"], weights)
     marker = read_marker(folder)
@@ -192,7 +192,7 @@ def with_weights(
         step=step_of(payload, weights),
         folder=folder,
         label=spec.name,
-        run=folder.name,
+        run=run_key(folder),
         checkpoint=checkpoint,
         changed=_changed(session, trained_with, None if marker is None else marker["files"]),
     )

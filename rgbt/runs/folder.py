@@ -153,6 +153,12 @@ def is_finished(folder: Path) -> bool:
     return (folder / "result.json").is_file()
 
 
+def run_key(folder: Path) -> str:
+    """The config key of the run in `folder`, which may be a replaced one: ``<key>-<n>``."""
+    is_replaced = folder.parent.name == REPLACED
+    return folder.name.rpartition("-")[0] if is_replaced else folder.name
+
+
 def counts_name(split: str) -> str:
     """Name of the file of the counts that a run ended with."""
     return f"counts_{split}.npz"

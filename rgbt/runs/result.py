@@ -29,6 +29,7 @@ from rgbt.runs.folder import (
     read_description,
     read_provenance,
     read_result,
+    run_key,
 )
 from rgbt.runs.provenance import commit_of, machine_name, other_code
 from rgbt.terminal import warn
@@ -176,7 +177,7 @@ class RunResult:
             try:
                 file = path.stat()
                 known = _measurement(path, file.st_mtime_ns, file.st_size)
-                if (known.run, known.checkpoint) == (self.key, "best"):
+                if (known.run, known.checkpoint) == (run_key(self.folder), "best"):
                     _check_step(known.step, result.get("best_step", known.step))
                 found[path.relative_to(self.folder).as_posix()] = known
             except InputError as error:
@@ -197,8 +198,9 @@ class RunResult:
     def _check_fits(self, counts: Counts, path: Path) -> None:
         """InputError: counts of another run, or not of the labels that its own counts are of."""
         advice = "restore the file of this run, or give its folder the name of the run"
-        if (run := counts.measurement.run) not in ("", self.key) and not self.run_id:
-            raise InputError(f"{path} has counts of the run {run}, not of {self.key}; {advice}.")
+        run, key = counts.measurement.run, run_key(self.folder)
+        if run not in ("", key) and not self.run_id:
+            raise InputError(f"{path} has counts of the run {run}, not of {key}; {advice}.")
         if protocol_of(counts.partition) and counts.counts.shape[1] % (len(counts.classes) + 1):
             raise InputError(f"{path} has other rows than {counts.partition}; {advice}.")
         result = read_result(self.folder)
