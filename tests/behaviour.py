@@ -31,6 +31,8 @@ import numpy as np
 import pytest
 import torch
 
+from rgbt.metrics.counts import Counts
+
 ROOT = Path(__file__).resolve().parents[1]
 RECORDED = Path(__file__).with_suffix(".json")
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf/experiment").glob("*.yaml"))
@@ -44,6 +46,7 @@ TEN_STEPS = [
 
 NAMING = ("vendor_id", "cpu family", "model", "stepping", "CPU implementer", "CPU part")
 MEASURED = ("images_per_s", "wait_share", "peak_memory_mib")
+COUNTED = ("absent", "classes", "counts", "dataset", "names", "partition", "split")
 REL_TOL, ABS_TOL = 1e-4, 1e-6
 """Of first losses on another kind of machine; later ones differ by up to 4%."""
 
@@ -100,13 +103,15 @@ def machine() -> dict[str, str]:
 
 
 def archive_digest(path: Path) -> str:
-    """Digest of the arrays of a ``.npz`` file; the file itself holds the time it was written."""
-    with np.load(path) as arrays:
-        parts = [
-            f"{name} {arrays[name].dtype} {arrays[name].shape}\0".encode() + arrays[name].tobytes()
-            for name in sorted(arrays)
-            if name not in ("format", "digest", "run")  # of the file, not of what was counted
-        ]
+    """Digest of what was counted; the file itself holds the time it was written, and the run."""
+    counts = Counts.load(path)
+    arrays: dict[str, Any] = {key: getattr(counts, key) for key in COUNTED}
+    arrays["night"] = np.array(counts.night or (), bool)
+    arrays["unscored"] = np.array(counts.unscored, str)
+    parts = []
+    for name, value in sorted(arrays.items()):
+        array = np.asanyarray(value)
+        parts.append(f"{name} {array.dtype} {array.shape}\0".encode() + array.tobytes())
     return digest(b"\0".join(parts))
 
 
