@@ -16,6 +16,7 @@ from analysis.results import (
     label_of,
     open_counts,
     results,
+    row_of,
     trainings,
 )
 from rgbt.checks import InputError
@@ -285,3 +286,17 @@ def test_missing_condition_is_reported(measured: Path, condition: str) -> None:
 def test_condition_of_several_severities_is_refused(measured: Path) -> None:
     with pytest.raises(InputError, match="condition=noise names test_noise-16.npz, test_noise-8"):
         open_counts("k0", measured, condition="noise")
+
+
+def test_levels_of_weights_that_were_all_predicted_otherwise_are_found(tmp_path: Path) -> None:
+    """What all files of a folder have in common, such as mirrored images, is no condition."""
+    usual = {"weights": "ab" * 32, "changed": ("prediction.mirrored",)}
+    noise = {"corruption": "noise", "title": "noise", "unit": "levels", "severity": 8.0}
+    changed = ("prediction.mirrored", "severity")
+    clean, noisy = remeasured(some(0), **usual), remeasured(some(1), **(usual | noise))
+    noisy = remeasured(noisy, changed=changed)
+    (tmp_path / "measured").mkdir()
+    for name, counts in (("clean", clean), ("noise", noisy)):
+        counts.save(tmp_path / "measured" / f"{name}.npz")
+    (training,) = trainings(str(tmp_path / "measured"))
+    assert [row_of(level) for level in training.levels] == ["clean", "noise"]

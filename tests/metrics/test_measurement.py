@@ -131,3 +131,22 @@ def test_another_text_in_a_file_is_refused(
         word = said if text == json.dumps(plain) else "not a readable file"
         with pytest.raises(InputError, match=word):
             read_measurement(path)
+
+
+def test_splits_of_statistics_are_named_between_two_networks() -> None:
+    first = other("statistics", statistics="adabn")
+    second = replace(first, run="another", statistics_of=("train",))
+    assert first.unlike(second) == ("statistics_of: none, ('train',)",)
+
+
+def test_the_step_is_named_of_one_network_alone() -> None:
+    assert OWN.unlike(replace(OWN, step=3)) == ("step: 0, 3",)
+    assert OWN.unlike(replace(OWN, step=3, run="another")) == ()
+
+
+@pytest.mark.parametrize(
+    "fields", [{"view": "foo"}, {"head": "third"}, {"severity": float("nan")}, {"absent": "no"}]
+)
+def test_a_field_that_no_network_has_is_refused(fields: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"^{next(iter(fields))}: expected"):
+        replace(OWN, **fields)
