@@ -154,6 +154,10 @@ class Measurement:
     @property
     def words(self) -> tuple[str, ...]:
         """What was changed, in the words of conditions: ("thermal", "noise_rgb", "adabn")."""
+        return (*self._names(), *self._changed_settings())
+
+    def _names(self) -> list[str]:
+        """`words` without the settings."""
         found = [self.view] if "view" in self.changed else []
         found += [self.partition] if "partition" in self.changed else []
         found += [self.corruption] if self.corruption else []
@@ -164,7 +168,7 @@ class Measurement:
         if "dataset" in self.changed:
             found += [f"{self.dataset_name.replace('/', '-')}-{self.dataset[:8]}"]
         found += [] if self.run or not self.weights else [f"weights-{self.weights[:8]}"]
-        return (*found, *(f"{key}={value}" for key, value in self._changed_settings().items()))
+        return found
 
     @property
     def condition(self) -> str:
@@ -184,8 +188,7 @@ class Measurement:
             found += [f"{TITLES[self.statistics]}{of}"]
         found += [f"last checkpoint, step {self.step}"] if self.checkpoint == "last" else []
         found += [self.dataset_name] if "dataset" in self.changed else []
-        settings = self._changed_settings().items()
-        return " · ".join([*found, *(f"{key}={value}" for key, value in settings)])
+        return " · ".join([*found, *self._changed_settings()])
 
     @property
     def file_name(self) -> str:
@@ -196,21 +199,20 @@ class Measurement:
         if self.is_own:
             return f"counts_{self.split}.npz"
         words = [self.split, *([] if self.run or "partition" in self.changed else [self.partition])]
-        settings = [f"{key}={value}" for key, value in self._changed_settings().items()]
-        for word in self.words[: len(self.words) - len(settings)]:
+        for word in self._names():
             is_corruption = self.unit and word == self.corruption
             words.append(f"{word}-{self.severity:.15g}" if is_corruption else word)
-        if settings:
+        if settings := self._changed_settings():
             words.append("_".join(word.rpartition(".")[2] for word in settings)[:LENGTH])
         # Values of settings, and other words for equal images, which the name may not tell apart.
         if self.dataset_words or any("." in key for key in self.changed):
             words.append(self.digest[:8])
         return "_".join(re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in words) + ".npz"
 
-    def _changed_settings(self) -> dict[str, str]:
-        # Those of a corruption are in its name.
+    def _changed_settings(self) -> list[str]:
+        """Changed settings as "key=value"; those of a corruption are in its name."""
         is_shown = {key for key in self.changed if not key.startswith("corruption.")}
-        return {key: value for key, value in self.settings if key in is_shown}
+        return [f"{key}={value}" for key, value in self.settings if key in is_shown]
 
     def to_json(self) -> str:
         """Every field, and the digest."""
