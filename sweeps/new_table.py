@@ -55,9 +55,9 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     from rgbt.config.compose import PIXELS
     from rgbt.files.atomic import write_atomic
     from sweeps.point import short_names
+    from sweeps.run.planner import specify_run
     from sweeps.space import grid_points, split
     from sweeps.table.table import PUBLISHED
-    from sweeps.worker.planner import specify_run
 
     path = folder / f"{name}.yaml"
     if path.exists() or (PUBLISHED / f"{name}.yaml").exists():

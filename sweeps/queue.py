@@ -19,14 +19,14 @@ from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps.point import Outcome, Point
+from sweeps.run.planner import Planner
+from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
+from sweeps.run.run_store import RunStore
 from sweeps.settings import SweepSettings
 from sweeps.table.request import TAG, seed_of
 from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
 from sweeps.verdicts.judge import contrasts_of
-from sweeps.worker.planner import Planner
-from sweeps.worker.point_list import PointList, preview_points, run_points
-from sweeps.worker.run_store import RunStore
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options
@@ -168,7 +168,12 @@ def run_queue(
     points = PointList(
         title, title, "list", queue.points, runs, planner, more=queue.more, rank=queue.rank
     )
+    if settings.commands is not None:
+        info(commands_line(points, settings))
+        return 0
     outcomes = (preview_points if options.dry_run else run_points)(points, settings)
+    if outcomes is None:
+        return 0
     queue.more(outcomes)
     if options.dry_run:
         print_rich(rich_table(queue.preview(outcomes)))

@@ -1,10 +1,11 @@
 """Run the missing runs of a table and print it: ``rgbt reproduce table=spatialseg/table3``.
 
-Rerun the command to resume. Any number of machines may run it at the same time.
+Rerun the command to resume. hydra/launcher=submitit_slurm or ray runs it on a cluster.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,11 +14,14 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir, Trust
-from rgbt.config.options import Help
+from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
+from rgbt.terminal import info
 from sweeps.new_table import NewOptions, new
 from sweeps.settings import SweepSettings
+
+HYDRA = ("hydra/launcher", "hydra.launcher.")  # beginnings of words that say where runs are trained
 
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 
@@ -40,7 +44,7 @@ class Options:
     dry_run: Annotated[bool, Help("true: only show runs, their states and the time")] = False
     runs_dir: RunsDir = Path("runs")
     out: Annotated[Path | None, Help("folder of the files; default: tables/ of the runs")] = None
-    workers: Annotated[int, Help("number of runs at the same time")] = 1
+    workers: Annotated[int | None, Help("runs at the same time; default: 1 here")] = None
     gpus: Annotated[
         tuple[int | tuple[int, ...], ...] | None,
         Help("GPU of each worker: gpus=[0,1]; or several: gpus=[[0,1],[2,3]]"),
@@ -53,8 +57,10 @@ class Options:
         Path("results")
     )
     fresh: Annotated[bool, Help("true: retrain runs of other code, and keep the old ones")] = False
-    wait: Annotated[bool, Help("true: wait for cells that other commands run")] = True
-    storage: Annotated[str | None, Help("of all machines: postgresql://user@host/name")] = None
+    wait: Annotated[bool, Help("false (SLURM, Ray): submit what is free, and end")] = True
+    stop_jobs: Annotated[bool, Help("true: Ctrl-C stops jobs of SLURM and Ray too")] = False
+    commands: Annotated[Path | None, Help("write a command for each missing run, run none")] = None
+    storage: Annotated[str | None, Help("address of Optuna's storage of the study")] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
     trust: Trust = ""
 
@@ -69,52 +75,66 @@ def main(options: Options, overrides: list[str]) -> int:
     all rows with that network. weights.ROW=FILE evaluates the network of a row with a file of
     weights; predictions.ROW=FOLDER counts its predicted label images. Neither is trained. A ROW is
     a label or a number: weights.Ours=FILE, predictions.3=FOLDER.
-    conf/hydra/sweeper/study.yaml explains the options of execution.
+    conf/hydra/sweeper/study.yaml explains the options of execution. Of a cluster:
+    hydra/launcher=submitit_slurm hydra.launcher.partition=gpu, or hydra/launcher=ray.
 
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
     from sweeps.queue import run_queue
     from sweeps.rendering.publish import print_preview, publish_table
+    from sweeps.run.point_list import commands_line, preview_points, run_points
     from sweeps.table_plan import plan_table, stored_and_planner
     from sweeps.verdicts.judge import rule_of
-    from sweeps.worker.point_list import preview_points, run_points
 
-    settings = settings_of(options)
+    of_hydra = [word for word in overrides if word.startswith(HYDRA)]
+    overrides = [word for word in overrides if word not in of_hydra]
+    settings = settings_of(options, of_hydra)
     runs, planner = stored_and_planner(options, overrides)
     if options.table == "all" or "," in options.table:
         return run_queue(options, overrides, settings, runs, planner)
     plan = plan_table(options, overrides, runs, planner)
+    if settings.commands is not None:
+        info(commands_line(plan.points, settings))
+        return 0
     if settings.dry_run:
         outcomes = preview_points(plan.points, settings)
-        print_preview(plan, outcomes, settings.workers)
+        print_preview(plan, outcomes, settings.workers or 1)
         return 0
     plan.evaluate_external(options.trust)
-    outcomes = run_points(plan.points, settings) if plan.points.points else []
+    found = run_points(plan.points, settings) if plan.points.points else []
+    if found is None:
+        return 0
     if plan.until_decided is None:  # an earlier command may have added seeds
-        plan.judge.rule = rule_of(result for each in outcomes for result in each.results)
+        plan.judge.rule = rule_of(result for each in found for result in each.results)
     name = f"{plan.request.name}_{plan.request.variant}"
     out = options.out or options.runs_dir / "tables" / name
-    return publish_table(plan, outcomes, out)
+    return publish_table(plan, found, out)
 
 
-def settings_of(options: Options) -> SweepSettings:
-    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``."""
-    from omegaconf import DictConfig, OmegaConf
+def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings:
+    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
 
-    from rgbt.config.compose import conf_dir
-    from sweeps.settings import read_settings
+    `of_hydra` are words such as hydra/launcher=ray.
+    """
+    from rgbt.config.command import composing
+    from rgbt.config.compose import compose_hydra
+    from sweeps.run.executors import check_launcher
+    from sweeps.settings import read_launcher, read_settings
 
-    node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
-    assert isinstance(node, DictConfig), "the file is a mapping"
+    words = (*of_hydra, *readable_paths([f"runs_dir={options.runs_dir}"]), "hydra.job.name=rgbt")
+    with composing(words):
+        node = compose_hydra(["hydra/sweeper=study", *words])
+        launcher = read_launcher(node)
+    check_launcher(launcher)
     # What Optuna's own pages show of a table; nothing is chosen by it.
-    node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
-    node.hours = options.minutes and options.minutes / 60
+    node.sweeper.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
+    node.sweeper.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
-        if key in node:
-            node[key] = value
+        if key in node.sweeper:
+            node.sweeper[key] = str(value) if isinstance(value, Path) else value
     try:
-        return read_settings(node)
+        return read_settings(node.sweeper, launcher)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, cast
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast
 
 from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
@@ -61,6 +61,13 @@ GpuSlot = Gpu | Annotated[tuple[Gpu, ...], Len(1, 64)]
 NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
 
+class Launcher(NamedTuple):
+    """The choice of ``hydra/launcher``, and its settings (``hydra.launcher``)."""
+
+    name: str = "basic"
+    options: dict[str, Any] = {}
+
+
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
@@ -68,11 +75,13 @@ class SweepSettings:
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     storage: Text | None
-    workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at the same time")]
+    workers: Annotated[int, Interval(ge=1, le=1024), doc("jobs at the same time")] | None
     gpus: Annotated[tuple[GpuSlot, ...], Len(1, 1024)] | None
     retry: Literal["none", "failed"]
     timeout_minutes: Positive | None
     wait: bool
+    stop_jobs: bool
+    commands: Text | None
     dry_run: bool
     study: Text | None
     params: dict[str, Any]
@@ -85,13 +94,14 @@ class SweepSettings:
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
     trust: Annotated[str, Len(0, 4096)]
+    launcher: Launcher = Launcher()
 
 
 # Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for.
 UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}
 
 
-def read_settings(node: DictConfig) -> SweepSettings:
+def read_settings(node: DictConfig, launcher: Launcher) -> SweepSettings:
     """Settings from the node ``hydra.sweeper``; InputError names a wrong or missing key."""
     raw = OmegaConf.to_container(node, resolve=False)
     assert isinstance(raw, dict), "the node of a sweeper is a mapping"
@@ -100,4 +110,11 @@ def read_settings(node: DictConfig) -> SweepSettings:
         value = raw[key] or UNRESOLVED[key] if key in UNRESOLVED else node[key]
         is_config = OmegaConf.is_config(value)
         plain[key] = OmegaConf.to_container(value, resolve=True) if is_config else value
-    return cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))
+    settings = cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))
+    return replace(settings, launcher=launcher)
+
+
+def read_launcher(node: DictConfig) -> Launcher:
+    """The launcher from the node ``hydra``."""
+    options = OmegaConf.to_container(node.launcher, resolve=True)
+    return Launcher(node.runtime.choices["hydra/launcher"], cast("dict[str, Any]", options))

@@ -6,8 +6,6 @@ draws it.
 
 from __future__ import annotations
 
-import hashlib
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
 
 # Optuna's states as shown.
 WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
-WORDS |= {"RUNNING": "running", "WAITING": "waiting"}
+WORDS |= {"RUNNING": "unfinished", "WAITING": "waiting"}
 
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
@@ -46,7 +44,7 @@ class Options:
     """Options of ``rgbt study``."""
 
     name: Annotated[str, Help("name of the study; without a name, all studies are listed")] = ""
-    storage: Annotated[str, Help("sqlite:///FILE or postgresql://...; default: studies.db")] = ""
+    storage: Annotated[str, Help("address of Optuna's storage; default: the study's folder")] = ""
     runs_dir: RunsDir = Path("runs")
     out: Annotated[Path | None, Help("folder of the report; default: studies/<name>")] = None
 
@@ -54,12 +52,13 @@ class Options:
 def main(options: Options, overrides: list[str]) -> int:
     """Show the results of a study: best trials, failures, importances."""
     del overrides  # none is heeded
-    from sweeps.worker.storage import known_studies, storage_url
+    from sweeps.run.optuna_study import known_studies, storage_url, study_folder
 
     known = known_studies(options.storage, options.runs_dir)
-    url = storage_url(options.storage, options.runs_dir)
     if options.name not in known:
-        raise InputError(f"name={options.name}: not in {url}; {nearest(options.name, known)}.")
+        where = options.storage or options.runs_dir / "studies"
+        raise InputError(f"name={options.name}: not in {where}; {nearest(options.name, known)}.")
+    url = storage_url(options.storage, options.runs_dir, options.name)
     out = options.out or study_folder(options.runs_dir, options.name)
     publish_study(known[options.name], out, url)
     return 0
@@ -90,12 +89,11 @@ class StudyData:
         import pandas as pd
 
         from rgbt.config.compose import with_pixels
-        from sweeps.worker.storage import counted_trials
 
         ways = [direction.name == "MAXIMIZE" for direction in study.directions]
         metrics = study.metric_names or [f"objective {n + 1}" for n in range(len(ways))]
         params, scores, rows = dict[str, None](), dict.fromkeys(metrics), []
-        for trial in counted_trials(study):
+        for trial in study.get_trials(deepcopy=False):
             notes, values = trial.user_attrs, zip(metrics, trial.values or (), strict=False)
             found = {**notes.get(names.RESULTS, {}), **dict(values)}
             factor = notes.get(names.PIXELS, 1.0)
@@ -253,14 +251,6 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     if find_spec("optuna_dashboard"):
         lines.append(("figures", f"optuna-dashboard {without_passwords(url)}"))
     print_rich(path_lines(lines))
-
-
-def study_folder(runs_dir: Path, name: str) -> Path:
-    """Folder of the report of a study; characters such as / in its name are replaced."""
-    safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:80]
-    if safe != name:
-        safe += "-" + hashlib.sha256(name.encode()).hexdigest()[:6]
-    return runs_dir / "studies" / safe
 
 
 entry = PlainCommand(Options, main, heeds=())

@@ -24,18 +24,25 @@ from sweeps import attributes as names
 from sweeps import space as spaces
 from sweeps.point import UNFINISHED, Point, short_names
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
-from sweeps.settings import SweepSettings, read_settings
+from sweeps.run import point_list
+from sweeps.run.driver import drive
+from sweeps.run.executors import check_launcher
+from sweeps.run.optuna_study import (
+    driving,
+    known_studies,
+    open_storage,
+    open_study,
+    storage_url,
+    study_folder,
+)
+from sweeps.run.planner import Planner, specify_run
+from sweeps.run.point_list import PointList
+from sweeps.run.progress import ProgressView, duration
+from sweeps.run.run_store import RunStore, open_run_store
+from sweeps.run.search_source import SearchSource
+from sweeps.settings import SweepSettings, read_launcher, read_settings
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
-from sweeps.study import publish_study, study_folder
-from sweeps.worker import point_list
-from sweeps.worker import storage as stores
-from sweeps.worker.driver import drive
-from sweeps.worker.planner import Planner, specify_run
-from sweeps.worker.point_list import PointList
-from sweeps.worker.progress import ProgressView, duration
-from sweeps.worker.run_store import RunStore, open_run_store
-from sweeps.worker.storage import TrialStore, counted_trials, known_studies
-from sweeps.worker.trial_sources import SamplerSource
+from sweeps.study import publish_study
 
 # Beginnings of overrides that may differ between two calls of the same sweep.
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
@@ -46,7 +53,8 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
 
     InputError: invalid settings, space or points. RunError: points failed; all others were run.
     """
-    settings = read_settings(config.hydra.sweeper)
+    settings = read_settings(config.hydra.sweeper, read_launcher(config.hydra))
+    check_launcher(settings.launcher)
     runs = open_run_store(config)
     # Text of `params` stands as it would be typed, other values as Hydra reads them.
     params = settings.params.items()
@@ -105,11 +113,17 @@ def _plain(words: Sequence[str]) -> list[str]:
 
 
 def _grid(points: PointList, settings: SweepSettings) -> None:
+    if settings.commands is not None:
+        info(point_list.commands_line(points, settings))
+        return
     if settings.dry_run:
         outcomes = point_list.preview_points(points, settings)
     else:
         # A typing error should not cost hours of other runs.
-        outcomes = point_list.run_points(points, settings, strict=True)
+        found = point_list.run_points(points, settings, strict=True)
+        if found is None:
+            return
+        outcomes = found
     tables = [unfinished_grid(outcomes)]
     if any(outcome.results for outcome in outcomes):
         tables.insert(0, group_grid(points.title, outcomes))
@@ -117,7 +131,7 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
     if other_code := point_list.other_code_line(outcomes):
         info(other_code)
     if settings.dry_run:
-        seconds = point_list.estimated_seconds(outcomes, settings.workers)
+        seconds = point_list.estimated_seconds(outcomes, settings.workers or 1)
         missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
         guess = "" if seconds is None else f", about {duration(seconds)}"
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
@@ -156,43 +170,51 @@ def search(request: Search, settings: SweepSettings) -> None:
     """
     if settings.trials is None and settings.hours is None:
         raise InputError("a search needs hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both.")
-    sampler, pruner = build_sampler(settings.sampler), build_pruner(settings.pruner)
+    if settings.commands is not None:
+        raise InputError("hydra.sweeper.commands is for grids, lists and tables: a search decides.")
+    build_sampler(settings.sampler), build_pruner(settings.pruner)
     is_reported = len(settings.objectives) == 1 and settings.objectives[0].is_reported
     if settings.pruner is not None and not is_reported:
         raise InputError("hydra.sweeper.pruner needs one objective that is reported, as val/mIoU.")
     runs_dir = request.runs.runs_dir
     if settings.dry_run:
-        known = known_studies(settings.storage, runs_dir).get(request.study)
-        done = 0 if known is None else len(counted_trials(known))
+        url = storage_url(settings.storage, runs_dir, request.study)
+        known = known_studies(url, runs_dir).get(request.study)
+        done = 0 if known is None else len(known.get_trials(deepcopy=False))
         space = "".join(f"{key}: {one}\n" for key, one in request.space.items())
         total = settings.trials or "any number of"
         sys.stdout.write(f"{space}study {request.study}: {done} of {total} trials exist.\n")
         return
+    if settings.launcher.name in ("submitit_slurm", "ray") and settings.workers is None:
+        raise InputError(
+            f"a search with hydra/launcher={settings.launcher.name} needs hydra.sweeper.workers=8: "
+            "how many trials are tried at once."
+        )
     dataset = probe(request, settings).dataset
-    storage = stores.open_storage(settings.storage, runs_dir)
-    request.runs.create_tables()
-    attributes = {names.KIND: "search", names.SIGNATURE: signature(request.identity, dataset)}
-    given = {"sampler": sampler, "pruner": pruner}
-    study = stores.open_study(request.study, storage, settings.objectives, attributes, **given)
+    with driving(runs_dir, request.study) as is_ours:
+        if is_ours:
+            _run_trials(request, settings, signature(request.identity, dataset))
+
+
+def _run_trials(request: Search, settings: SweepSettings, identity: str) -> None:
+    runs_dir = request.runs.runs_dir
+    url = storage_url(settings.storage, runs_dir, request.study)
+    attributes = {names.KIND: "search", names.SIGNATURE: identity}
+    samplers = {"sampler": build_sampler(settings.sampler), "pruner": build_pruner(settings.pruner)}
+    objectives = settings.objectives
+    study = open_study(request.study, open_storage(url), objectives, attributes, **samplers)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
-    store = TrialStore(study, storage)
-    info(f"study {request.study}: run the same command on other machines to share it.")
-
-    def progress() -> tuple[int, int | None]:
-        return sum(trial.state.is_finished() for trial in store.trials()), settings.trials
-
-    view = ProgressView(request.study, settings.workers, progress)
-    source = SamplerSource(request.fixed, request.space, store, Planner(), settings, view.say)
+    view = ProgressView(request.study)
+    source = SearchSource(request.fixed, request.space, study, settings, view.say)
     drive(view, source, request.runs, settings)
 
-    trials = store.trials()
+    trials = study.get_trials(deepcopy=False)
     states = Counter(trial.state.name for trial in trials)
     for trial in [trial for trial in trials if trial.state.name == "FAIL"][:5]:
         info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
-    url = stores.storage_url(settings.storage, runs_dir)
     publish_study(study, study_folder(runs_dir, request.study), url)
 
 

@@ -15,6 +15,9 @@ from rgbt.config.component import Component
 from rgbt.config.compose import available, compose
 from rgbt.config.options import readable_paths
 from sweeps.point import Outcome
+from sweeps.run.planner import Planner
+from sweeps.run.point_list import PointList
+from sweeps.run.run_store import RunStore, open_run_store
 from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import PREVIOUS
 from sweeps.table.efficiency import network_sizes
@@ -23,9 +26,6 @@ from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
 from sweeps.table.table import PUBLISHED, Row, Table, is_own, load_table, table_names, table_path
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
-from sweeps.worker.planner import Planner
-from sweeps.worker.point_list import PointList
-from sweeps.worker.run_store import RunStore, open_run_store
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options

@@ -35,7 +35,7 @@ def serve(path: str) -> None:
     import selectors
     import signal
 
-    import sweeps.worker.preload  # noqa: F401 - the libraries, and the modules of rgbt
+    import sweeps.run.preload  # noqa: F401 - the libraries, and the modules of rgbt
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for a program but its client
     with socket.socket(socket.AF_UNIX) as server, selectors.DefaultSelector() as selector:

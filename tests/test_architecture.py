@@ -58,11 +58,11 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    "sweeps.worker": {"sweeps.space"},
+    "sweeps.run": {"sweeps.space"},
     "sweeps.space": set(),
     "sweeps.report": {f"sweeps.{e}" for e in ("worker", "table", "verdicts", "rendering")},
-    "sweeps.table": {"sweeps.worker"},
-    "sweeps.verdicts": {"sweeps.table", "sweeps.worker"},
+    "sweeps.table": {"sweeps.run"},
+    "sweeps.verdicts": {"sweeps.table", "sweeps.run"},
     "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "verdicts")},
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),

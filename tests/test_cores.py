@@ -86,7 +86,7 @@ def test_openmp_of_the_runs_of_a_sweep_has_read_the_value(
 SWEEP = """
 import time
 from pathlib import Path
-from sweeps.worker.processes import LocalExecutor
+from sweeps.run.processes import LocalExecutor
 job = LocalExecutor({workers}).start(["this"], {{}}, Path("log"))
 while job.poll() is None:
     time.sleep(0.05)

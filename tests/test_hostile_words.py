@@ -28,7 +28,7 @@ from sweeps.reproduce import entry as reproduce
 from sweeps.study import entry as study
 from sweeps.table.request import REQUESTED, TAG
 from sweeps.verdicts import stored
-from sweeps.worker import storage
+from sweeps.run import storage
 from tests.commands import Call, Trained, short
 from tests.measured import remeasured
 

@@ -17,7 +17,7 @@ from mlflow.tracking import MlflowClient
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
-from sweeps.worker.processes import LocalExecutor, LocalJob
+from sweeps.run.processes import LocalExecutor, LocalJob
 from tests.checkpoints.test_torch_files import same
 from tests.commands import only_run
 from tests.conftest import write_data

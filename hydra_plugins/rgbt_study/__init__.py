@@ -6,8 +6,11 @@ also for ``--help``. This module is therefore only a stub, which imports `sweeps
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from hydra.core.utils import JobReturn
+from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
@@ -36,3 +39,25 @@ class StudySweeper(Sweeper):
         assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
         assert self.config is not None, "as above"
         sweep(arguments, self.config, self.hydra_context.config_loader)
+
+
+class RayLauncher(Launcher):
+    """The settings of ``conf/hydra/launcher/ray.yaml``, which `StudySweeper` alone reads."""
+
+    def __init__(self, **settings: Any) -> None:
+        del settings
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """InputError: another sweeper wants to launch jobs with it."""
+        del hydra_context, task_function, config
+        from rgbt.checks import InputError
+
+        raise InputError("hydra/launcher=ray needs hydra/sweeper=study.")
+
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence[JobReturn]:
+        """Never called, see `setup`."""
+        raise NotImplementedError

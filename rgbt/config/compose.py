@@ -86,6 +86,14 @@ def composed(overrides: Sequence[str]) -> tuple[DictConfig, bool]:
     return config, is_search
 
 
+def compose_hydra(words: Sequence[str]) -> DictConfig:
+    """The node ``hydra`` of the configuration, with its own words (``hydra/launcher=ray``)."""
+    with own_hydra():
+        config = hydra.compose("config", list(words), return_hydra_config=True)
+    OmegaConf.set_readonly(config.hydra, False)
+    return cast("DictConfig", config.hydra)
+
+
 @lru_cache(maxsize=4096)
 def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, ...]]:
     """The words that choose files, and the overrides that set values afterwards.

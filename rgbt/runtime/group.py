@@ -40,13 +40,18 @@ def group_from_environment() -> Group | None:
     return group if group.size > 1 else None
 
 
+def end_with_parent(number: signal.Signals) -> None:
+    """Get this signal when the process that started this one ends (Linux; elsewhere nothing)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+
+
 @contextmanager
 def taking_part() -> Iterator[None]:
     """Begin a command that may be one of several processes of a run; see the module."""
     group = group_from_environment()
     if group is not None and "TORCHELASTIC_RUN_ID" in os.environ:
-        with suppress(OSError, AttributeError):  # Linux: end with torchrun, also if that is killed
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        end_with_parent(signal.SIGKILL)  # with torchrun, also if that is killed
     if group is None or group.rank == 0:
         yield
         return

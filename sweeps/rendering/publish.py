@@ -18,10 +18,10 @@ from sweeps.rendering.claims import claim_grids, claims_frame, claims_markdown, 
 from sweeps.rendering.effects import effects_figure, effects_grids
 from sweeps.rendering.figure import figure_of
 from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
+from sweeps.run.point_list import estimated_seconds, other_code_line
+from sweeps.run.progress import duration
 from sweeps.table.cells import NO_VALUE
 from sweeps.verdicts.stored import TableResult
-from sweeps.worker.point_list import estimated_seconds, other_code_line
-from sweeps.worker.progress import duration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -30,10 +30,10 @@ from sweeps.rendering.claims import (
 )
 from sweeps.rendering.publish import drawn_of, grid_of, grids_of
 from sweeps.rendering.table import MARKDOWN
+from sweeps.run.progress import duration
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.request import TAG
 from sweeps.verdicts.stored import TableResult, TableResults
-from sweeps.worker.progress import duration
 
 if TYPE_CHECKING:
     import pandas as pd

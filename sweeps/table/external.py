@@ -32,10 +32,10 @@ from rgbt.runs.result import OWN, RunResult
 from rgbt.terminal import info
 from sweeps.evaluation import Words, command_of, stored_at
 from sweeps.point import Outcome, Point
+from sweeps.run.local import run_command
 from sweeps.table.cells import is_counted, words_of
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
-from sweeps.worker.processes import run_command
 
 FOLDER = "external"  # inside the folder of runs
 NODE_FILE = "of_the_table"  # file of conf/dataset and conf/metric, for the commands

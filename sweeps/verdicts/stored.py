@@ -14,6 +14,7 @@ from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from sweeps.point import Outcome, Point
+from sweeps.run.planner import Planner
 from sweeps.table.cells import ScoredTable, score, size_marks
 from sweeps.table.efficiency import network_sizes
 from sweeps.table.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
@@ -27,7 +28,6 @@ from sweeps.verdicts.judge import (
     TableJudge,
     rule_of,
 )
-from sweeps.worker.planner import Planner
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 

@@ -25,14 +25,14 @@ from sweeps.evaluation import Words, measurement_of
 from sweeps.point import Point
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space import build_sampler, parse_space
-from sweeps.worker import driver as drivers
-from sweeps.worker.driver import Driver
-from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.point_list import ListSource, PointList
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import RunningTrial
-from sweeps.worker.storage import STALE_S, TrialStore, open_storage, open_study
-from sweeps.worker.trial_sources import SamplerSource
+from sweeps.run import driver as drivers
+from sweeps.run.driver import Driver
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.point_list import ListSource, PointList
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_trial import RunningTrial
+from sweeps.run.storage import STALE_S, TrialStore, open_storage, open_study
+from sweeps.run.trial_sources import SamplerSource
 from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"

@@ -16,9 +16,9 @@ from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import queue as queues
 from sweeps.point import Point
 from sweeps.reproduce import Options, settings_of
-from sweeps.worker import driver as drivers
-from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.run_store import RunStore
+from sweeps.run import driver as drivers
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
     Behaviour,
     Call,

@@ -12,8 +12,8 @@ from rgbt.runs.result import OWN
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import Options, entry, settings_of
 from sweeps.settings import SweepSettings
-from sweeps.worker import point_list
-from sweeps.worker.point_list import PointList
+from sweeps.run import point_list
+from sweeps.run.point_list import PointList
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
 

@@ -24,10 +24,10 @@ from sweeps.point import Outcome, Point
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space import parse_space
 from sweeps.sweep import Search, probe, search, sweep
-from sweeps.worker import point_list
-from sweeps.worker.point_list import PointList
-from sweeps.worker.run_store import open_run_store
-from sweeps.worker.storage import open_storage
+from sweeps.run import point_list
+from sweeps.run.point_list import PointList
+from sweeps.run.run_store import open_run_store
+from sweeps.run.storage import open_storage
 from tests.commands import SPLITS, short, words_of
 from tests.conftest import write_data
 from tests.sweeps.fakes import settings as plain_settings

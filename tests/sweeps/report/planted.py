@@ -16,7 +16,7 @@ from rgbt.runs.naming import describe
 from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
 from sweeps.table_plan import make_request, row_digests
-from sweeps.worker.planner import Planner
+from sweeps.run.planner import Planner
 from tests.analysis.counts import result_of
 from tests.measured import remeasured
 from tests.sweeps.verdicts.accuracies import accuracy

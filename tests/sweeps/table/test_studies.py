@@ -7,7 +7,7 @@ import pytest
 from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
 from sweeps.table_plan import make_request
-from sweeps.worker.planner import Planner
+from sweeps.run.planner import Planner
 
 MISSING = "missing_image"
 

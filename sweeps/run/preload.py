@@ -19,7 +19,7 @@ LIBRARIES = (
     "torch",
     "hydra",
     "scipy.optimize",
-    "sweeps.worker.processes",
+    "sweeps.run.processes",
     "mlflow",
     "mlflow.store.tracking.sqlalchemy_store",
 )

@@ -22,9 +22,9 @@ import optuna
 import pytest
 
 from sweeps import attributes as names
-from sweeps.worker import driver as drivers
-from sweeps.worker import storage as stores
-from sweeps.worker.storage import open_storage
+from sweeps.run import driver as drivers
+from sweeps.run import storage as stores
+from sweeps.run.storage import open_storage
 from tests.sweeps.fakes import list_desk, points, scored, search_desk, until
 
 pytestmark = pytest.mark.slow

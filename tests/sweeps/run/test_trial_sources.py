@@ -11,7 +11,7 @@ from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
 from sweeps import attributes as names
 from sweeps.settings import Objective
-from sweeps.worker.running_trial import ClaimedTrial
+from sweeps.run.running_trial import ClaimedTrial
 from tests.sweeps.fakes import Desk, PickyPlanner, search_desk
 
 

@@ -10,7 +10,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.runs.specify import specify
 from sweeps.point import Point
-from sweeps.worker.planner import Planner
+from sweeps.run.planner import Planner
 
 
 @pytest.fixture

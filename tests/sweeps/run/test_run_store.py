@@ -13,7 +13,7 @@ from rgbt.checks import RunError
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
-from sweeps.worker.run_store import RunStore
+from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import DATASET, finish
 
 

@@ -19,6 +19,7 @@ from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tracker import Tracking
 from sweeps.evaluation import Words, stored_at
+from sweeps.run.planner import PlannedPoint
 
 
 @dataclass
@@ -58,6 +59,13 @@ class RunStore:
                 f"now {dataset[:8]}); use another folder of runs (runs_dir=...)."
             )
         return None if self._is_outdated(result) else result
+
+    def of_point(self, plan: PlannedPoint) -> tuple[RunResult, ...]:
+        """The runs of a point if all are finished, evaluated or not; () otherwise; see `find`."""
+        wanted = plan.point.evaluations
+        found = [self.find(run.key, plan.fingerprints[run.key], wanted) for run in plan.runs]
+        results = tuple(result for result in found if result is not None)
+        return results if len(results) == len(found) else ()
 
     def replace_outdated(self, key: str) -> None:
         """Move a finished run that `find` ignores out of the way of a new training."""

@@ -12,9 +12,11 @@ from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import compose, with_pixels
 from rgbt.runs.provenance import without_passwords
+from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
 from sweeps import attributes as names
+from sweeps.evaluation import stored_at
 from sweeps.point import Point
 
 
@@ -41,6 +43,11 @@ class PlannedPoint:
             names.PIXELS: self.runs[0].scale.pixel_factor,
             names.LABEL: self.point.label,
         }
+
+    def is_evaluated(self, results: Sequence[RunResult]) -> bool:
+        """Whether there are runs, and all further evaluations of them."""
+        wanted = self.point.evaluations
+        return bool(results) and all(stored_at(one, each) for one in results for each in wanted)
 
 
 def specify_run(overrides: Sequence[str], *, checked: bool = True) -> RunSpec:

@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
+from rgbt.files.atomic import is_held, write_atomic
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from sweeps import attributes as names
-from sweeps.evaluation import stored_at
-from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
+from sweeps.point import UNFINISHED, Outcome, Point, varied_keys
+from sweeps.run.driver import drive, work_of
+from sweeps.run.optuna_study import (
+    add_trial,
+    driving,
+    known_studies,
+    open_storage,
+    open_study,
+    storage_url,
+)
+from sweeps.run.planner import PlannedPoint, Planner
+from sweeps.run.progress import ProgressView, bars
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_point import End, Task
 from sweeps.settings import SweepSettings
-from sweeps.worker import storage as stores
-from sweeps.worker.driver import drive
-from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.progress import ProgressView, bars
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import ClaimedTrial
-from sweeps.worker.storage import TrialStore, known_studies, trials_by_key
 
 if TYPE_CHECKING:
     import optuna
-    from optuna.trial import FrozenTrial
 
 
 @dataclass(frozen=True)
@@ -54,23 +63,39 @@ class PointList:
 
 
 class ListSource:
-    """Plans the points of a list, and claims them in their order; `store` is set in between.
+    """Plans the points of a list and gives them in their order; equal points are one.
 
-    With `strict`, one wrong point is refused, and not only a list of wrong points.
+    `study` gets what ends, and says what failed before; of a preview (`is_dry`) nothing is written,
+    and None is a study that does not exist yet. With `strict`, one wrong point is refused, and not
+    only a list of wrong points.
     """
 
-    store: TrialStore
-
-    def __init__(self, points: PointList, settings: SweepSettings, *, strict: bool = False) -> None:
+    def __init__(
+        self,
+        points: PointList,
+        settings: SweepSettings,
+        study: optuna.Study | None,
+        *,
+        strict: bool = False,
+        is_dry: bool = False,
+    ) -> None:
         self._list, self._settings, self._strict = points, settings, strict
+        self._study = None if is_dry else study
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}
         self.errors: dict[int, str] = {}
         # Indices of equal points, by key; the first one is run.
         self._same: dict[str, list[int]] = {}
-        self._forgiven: set[int] | None = None
+        self._running: set[str] = set()  # keys
         self._finished: dict[str, tuple[RunResult, ...]] = {}
-        self._seen: set[int | str] = set()  # failed trials whose runs were looked for, and keys
+        self._recorded: set[str] = set()  # keys of finished points that the study has
+        self._failed: dict[str, str] = {}  # key -> reason
+        for trial in study.get_trials(deepcopy=False) if study else ():
+            key = trial.user_attrs.get(names.KEY, "")
+            if trial.state.name == "COMPLETE":
+                self._recorded.add(key)
+            elif settings.retry == "none":
+                self._failed[key] = str(trial.user_attrs.get(names.REASON))
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -108,57 +133,56 @@ class ListSource:
             self._plans[index] = plan
             self._same.setdefault(plan.key, []).append(index)
 
-    def next(self) -> ClaimedTrial | None:
-        """See `TrialSource.next`."""
+    def next(self) -> Task | None:
+        """See `Source.next`."""
         more, rank = self._list.more, self._list.rank
         if more and rank:
             self._add(more(self.outcomes()))
-        claimed = self._claim()
+        task = self._next_waiting()
         # Points that were added before this command was stopped are finished: others follow them.
-        while claimed is None and more and self._add(more(self.outcomes())):
-            claimed = self._claim()
-        return claimed
+        while task is None and more and self._add(more(self.outcomes())):
+            task = self._next_waiting()
+        return task
 
-    def _claim(self) -> ClaimedTrial | None:
-        by_key = trials_by_key(self.store.study)
+    def _next_waiting(self) -> Task | None:
         for plan in self._different():
-            if self._status(plan, by_key).state != "waiting":
-                continue
-            # Failed trials of the point, and those whose runs were deleted.
-            replaced = [trial.number for trial in by_key.get(plan.key, ())]
-            number = self.store.claim(plan.attributes, replaced)
-            if number is not None:
-                return ClaimedTrial(plan, number)
+            if self._outcome(plan).state == "waiting":
+                self._running.add(plan.key)
+                return Task(plan)
         return None
 
-    def is_exhausted(self, *, wait: bool) -> bool:
-        """See `TrialSource.is_exhausted`."""
-        by_key = trials_by_key(self.store.study)
-        if any(self._status(plan, by_key).state == "waiting" for plan in self._different()):
-            return False
-        # A killed driver may leave a second trial of a finished point, which is failed when stale.
-        trials = [trial for key in self._same for trial in by_key.get(key, ())]
-        return not (wait and any(trial.state.name == "RUNNING" for trial in trials))
+    def record(self, task: Task, end: End) -> End:
+        """See `Source.record`."""
+        key = task.plan.key
+        self._running.discard(key)
+        if end.state == "finished":
+            self._finished[key] = end.results
+        else:
+            self._failed[key] = end.reason
+        return self._record(task.plan, end)
 
-    def states(self) -> list[State]:
-        """The states of the different points."""
-        by_key = trials_by_key(self.store.study)
-        return [self._status(plan, by_key).state for plan in self._different()]
+    def counts(self) -> Counter[str]:
+        """See `Source.counts`; a state is as it was when it was looked at."""
+        keys = set(self._same)
+        found = Counter(finished=len(keys & set(self._finished)), running=len(self._running))
+        found["failed"] = len((keys & set(self._failed)) - set(self._finished) - self._running)
+        found["waiting"] = len(keys) - found.total()
+        return found
 
-    def outcomes(
-        self, study: optuna.Study | None = None, *, preview: bool = False
-    ) -> list[Outcome]:
-        """One outcome per point, in order, by the study; of a preview by all finished runs too."""
-        by_key = trials_by_key(study if preview else self.store.study)
+    def outcomes(self, *, preview: bool = False) -> list[Outcome]:
+        """One outcome per point, in order; of a preview with runs that others train now."""
         found = []
         for index, point in enumerate(self._points):
             if index in self.errors:
                 found.append(Outcome(point, "failed", self.errors[index]))
                 continue
-            outcome = self._status(plan := self._plans[index], by_key)
-            if preview:
+            plan = self._plans[index]
+            outcome = self._outcome(plan)
+            if preview and outcome.state == "waiting":
+                folders = [self._list.runs.runs_dir / run.key for run in plan.runs]
+                is_running = any(is_held(folder / "lock") for folder in folders)
                 results = finished_runs(plan, self._list.runs)
-                state = "finished" if is_evaluated(plan, results) else outcome.state
+                state = "running" if is_running else outcome.state
                 outcome = replace(outcome, state=state, results=results)
             found.append(outcome)
         return found
@@ -169,83 +193,88 @@ class ListSource:
             return plans
         return iter(sorted(plans, key=lambda plan: rank(plan.point), reverse=True))
 
-    def _status(self, plan: PlannedPoint, by_key: Mapping[str, list[FrozenTrial]]) -> Outcome:
-        """The state of a point by the study and the finished runs."""
-        if self._forgiven is None:
-            before = sum(by_key.values(), []) if self._settings.retry == "failed" else []
-            self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
-        trials = by_key.get(plan.key, ())
-        states = {trial.state.name for trial in trials}
-        failed = [trial for trial in trials if trial.state.name == "FAIL"]
-        # The runs of a failed point may have been finished by hand since; what is ranked depends
-        # on all that has ever been run.
-        looked: set[int | str] = {trial.number for trial in failed}
-        unseen = (looked | ({plan.key} if self._list.rank else set())) - self._seen
-        self._seen |= unseen
-        if ("COMPLETE" in states or unseen) and plan.key not in self._finished:
-            results = finished_runs(plan, self._list.runs)
-            if is_evaluated(plan, results):
-                self._finished[plan.key] = results
-        counted = [trial for trial in failed if trial.number not in self._forgiven]
+    def _outcome(self, plan: PlannedPoint) -> Outcome:
+        """The state of a point by its run folders, and by what failed before."""
         outcome = Outcome(plan.point, "waiting", keys=tuple(run.key for run in plan.runs))
+        if plan.key in self._running:
+            return replace(outcome, state="running")
+        if plan.key not in self._finished:
+            results = finished_runs(plan, self._list.runs)
+            if plan.is_evaluated(results):
+                self._finished[plan.key] = results
+                self._record(plan, End("finished", results=results))
         if plan.key in self._finished:
             return replace(outcome, state="finished", results=self._finished[plan.key])
-        if "RUNNING" in states:
-            return replace(outcome, state="running")
-        if counted:
-            reason = str(counted[-1].user_attrs[names.REASON])
-            return replace(outcome, state="failed", reason=reason)
+        if plan.key in self._failed:
+            return replace(outcome, state="failed", reason=self._failed[plan.key])
         return outcome
+
+    def _record(self, plan: PlannedPoint, end: End) -> End:
+        """Add a trial to the study, one for a finished point; the end as it counts."""
+        end = end.checked(self._settings.objectives)
+        if self._study is None or (plan.key in self._recorded and end.state == "finished"):
+            return end
+        for result in end.results:
+            self._list.runs.tag(result, plan.point.tags)
+        if end.state == "finished":
+            self._recorded.add(plan.key)
+        add_trial(self._study, {**plan.attributes, **end.notes()}, end, self._settings.objectives)
+        return end
 
 
 def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
     """The runs of a point if all are finished, evaluated or not; () otherwise."""
-    wanted = plan.point.evaluations
     try:
-        found = [runs.find(run.key, plan.fingerprints[run.key], wanted) for run in plan.runs]
+        return runs.of_point(plan)
     except RunError:  # raised again when the point is executed
         return ()
-    results = tuple(result for result in found if result is not None)
-    return results if len(results) == len(found) else ()
-
-
-def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
-    """Whether there are runs, and all further evaluations of them."""
-    wanted = plan.point.evaluations
-    return bool(results) and all(stored_at(result, each) for result in results for each in wanted)
 
 
 def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     """The present state of the points; nothing is run and nothing written."""
-    source = ListSource(points, settings)
-    study = known_studies(settings.storage, points.runs.runs_dir).get(points.study)
-    return source.outcomes(study, preview=True)
+    runs_dir = points.runs.runs_dir
+    url = storage_url(settings.storage, runs_dir, points.study)
+    study = known_studies(url, runs_dir).get(points.study)
+    return ListSource(points, settings, study, is_dry=True).outcomes(preview=True)
 
 
 def run_points(
     points: PointList, settings: SweepSettings, *, strict: bool = False
-) -> list[Outcome]:
+) -> list[Outcome] | None:
     """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
+
+    None: another process drives the study, which is said.
 
     Raises:
         InputError: the storage or the executor cannot be used, all points have a wrong
             configuration, or with `strict` one of them.
     """
-    source = ListSource(points, settings, strict=strict)
-    storage = stores.open_storage(settings.storage, points.runs.runs_dir)
-    study = stores.open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
-    source.store = TrialStore(study, storage)
+    runs_dir = points.runs.runs_dir
+    with driving(runs_dir, points.study) as is_ours:
+        if not is_ours:
+            return None
+        storage = open_storage(storage_url(settings.storage, runs_dir, points.study))
+        attributes = {names.KIND: points.kind}
+        study = open_study(points.study, storage, settings.objectives, attributes)
+        source = ListSource(points, settings, study, strict=strict)
+        for index, reason in source.errors.items():  # before hours of training
+            label = points.points[index].label
+            info(f"{label}: {reason.removeprefix(f'{label}: ')}")
+        drive(ProgressView(points.title), source, points.runs, settings)
+        return source.outcomes()
 
-    def progress() -> tuple[int, int]:
-        states = source.states()
-        return sum(state in ("finished", "failed") for state in states), len(states)
 
-    for index, reason in source.errors.items():  # before hours of training
-        label = points.points[index].label
-        info(f"{label}: {reason.removeprefix(f'{label}: ')}")
-    view = ProgressView(points.title, settings.workers, progress)
-    drive(view, source, points.runs, settings)
-    return source.outcomes()
+def commands_line(points: PointList, settings: SweepSettings) -> str:
+    """Write a line of shell for every point that is not finished; what was done, in a sentence."""
+    source, lines = ListSource(points, settings, None, is_dry=True), list[str]()
+    while (task := source.next()) is not None:
+        work = work_of(task.plan, points.runs, settings.trust)
+        variables = [f"{name}={value}" for name, value in work.environment.items() if value]
+        steps = (["env", *variables, sys.executable, "-m", *step.words] for step in work.steps)
+        lines.append(" && ".join(map(shlex.join, steps)))
+    file = Path(settings.commands or "")
+    write_atomic(file, "".join(f"{line}\n" for line in lines).encode())
+    return f"{len(lines)} commands in {file}, one a line; run them in this folder."
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:

@@ -12,7 +12,7 @@ import pytest
 from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import Objective
-from sweeps.worker import driver as drivers
+from sweeps.run import driver as drivers
 from tests.sweeps.fakes import (
     Call,
     Desk,

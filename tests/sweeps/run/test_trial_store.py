@@ -8,7 +8,7 @@ import pytest
 
 from sweeps import attributes as names
 from sweeps.space import build_sampler
-from sweeps.worker.storage import TrialStore
+from sweeps.run.storage import TrialStore
 from tests.sweeps.fakes import memory, silence, store_on
 
 

@@ -9,8 +9,8 @@ import pytest
 from rgbt.checks import InputError
 from sweeps import attributes as names
 from sweeps.settings import Objective
-from sweeps.worker import storage as stores
-from sweeps.worker.storage import known_studies, open_storage, open_study
+from sweeps.run import storage as stores
+from sweeps.run.storage import known_studies, open_storage, open_study
 
 UP = (Objective("test/mIoU", "maximize"),)
 BOTH = (*UP, Objective("test/Var", "minimize"))

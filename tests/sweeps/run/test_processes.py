@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.worker import processes
-from sweeps.worker.processes import (
+from sweeps.run import processes
+from sweeps.run.processes import (
     LocalExecutor,
     LocalJob,
     check_gpus,
@@ -178,7 +178,7 @@ def test_stop_kills_after_grace_with_children(
 DRIVER = """
 import sys, time
 from pathlib import Path
-from sweeps.worker import processes
+from sweeps.run import processes
 
 if __name__ == "__main__":
     sys.path.insert(0, sys.argv[1])
@@ -244,7 +244,7 @@ def test_run_command_has_reason_of_failure(executor: LocalExecutor, tmp_path: Pa
 
 SERVER = """
 import sys
-from sweeps.worker import preload
+from sweeps.run import preload
 from rgbt.runs import provenance
 before = provenance.code()["code"]
 provenance.package_digest = lambda package: "edited since"

@@ -15,10 +15,10 @@ from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.evaluation import Words, counts_of
 from sweeps.point import Point
-from sweeps.worker import running_trial as works
-from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import (
+from sweeps.run import running_trial as works
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_trial import (
     LOGS,
     ClaimedTrial,
     PruningCallback,

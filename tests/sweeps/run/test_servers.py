@@ -14,11 +14,11 @@ import pytest
 from mlflow import MlflowClient
 
 from sweeps.attributes import LABEL, RUNS
-from sweeps.worker.storage import counted_trials, open_storage
+from sweeps.run.storage import counted_trials, open_storage
 from tests.commands import SMALL, short
 from tests.sweeps.fakes import until
 from tests.sweeps.servers import mlflow_server, new_database, postgres
-from tests.sweeps.worker.test_lost_drivers import survive
+from tests.sweeps.run.test_lost_drivers import survive
 
 pytestmark = pytest.mark.slow
 

@@ -18,9 +18,9 @@ from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.worker import driver as drivers
-from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.point_list import (
+from sweeps.run import driver as drivers
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.point_list import (
     ListSource,
     PointList,
     estimated_seconds,
@@ -30,8 +30,8 @@ from sweeps.worker.point_list import (
     preview_points,
     run_points,
 )
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import ClaimedTrial
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_trial import ClaimedTrial
 from tests.sweeps.fakes import (
     Desk,
     FakeExecutor,

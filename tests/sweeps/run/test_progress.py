@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from sweeps.point import Point
-from sweeps.worker import progress
-from sweeps.worker.progress import ProgressView, duration
+from sweeps.run import progress
+from sweeps.run.progress import ProgressView, duration
 
 Make = Callable[[bool], io.StringIO]
 LABEL = "files=[/data/a] [red]not a colour[/red]"

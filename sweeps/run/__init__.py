@@ -1,0 +1,1 @@
+"""Execution of points: the driver of a study, executors, jobs, finished runs."""

@@ -1,0 +1,180 @@
+"""The driver of a study: it hands points to an executor, and records how they end.
+
+There is one driver a study (`driving`). A driver that was killed is started again by the same
+command: jobs that still run are waited for, and everything else resumes from its run folder.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from rgbt.checks import InputError, RunError
+from rgbt.config.compose import OWN_FOLDERS, own_folders
+from rgbt.cores import usable_cores
+from rgbt.files.atomic import is_held
+from rgbt.runs.naming import TAGS
+from sweeps.evaluation import command_of, stored_at
+from sweeps.run.executors import Executor, open_executor
+from sweeps.run.job import TRAINING, Step, Work
+from sweeps.run.local import LocalExecutor
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.progress import ProgressView
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_point import End, RunningPoint, Task
+from sweeps.settings import SweepSettings
+
+POLL_S = 0.2
+LOGS = ".logs"  # folder in the folder of runs: output of jobs, one file a point
+# Settings of a run that its evaluations get, too.
+FOLDERS = ("dataset.root=", "dataset.cache_dir=")
+
+
+class Source(Protocol):
+    """Gives a driver its points, and records their ends in the study."""
+
+    def next(self) -> Task | None:
+        """The next point that is not finished; None: there is none at the moment."""
+
+    def record(self, task: Task, end: End) -> End:
+        """Record how a point ended; the end as it counts."""
+
+    def counts(self) -> Counter[str]:
+        """Points by their state: finished, failed, pruned, running, waiting; without end: none."""
+
+
+@dataclass
+class Driver:
+    """Executes the points of a source; `running` are those whose jobs are queued or run."""
+
+    source: Source
+    runs: RunStore
+    executor: Executor
+    settings: SweepSettings
+    view: ProgressView
+    running: list[RunningPoint] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._began, self._has_reported_cores = time.monotonic(), False
+
+    def run(self) -> None:
+        """Execute points until none is left; with ``wait=false`` until all free ones are queued.
+
+        On Ctrl-C or SIGTERM, jobs that would end with this command save and stop, and others with
+        ``stop_jobs=true``.
+        """
+        try:
+            while self._step():
+                time.sleep(POLL_S)
+        except BaseException:
+            if self.settings.stop_jobs or not self.executor.is_lasting:
+                self._stop()
+            raise
+
+    def _step(self) -> bool:
+        """Look at all jobs, and submit new ones; whether there is more to do."""
+        ended = [point for point in self.running if self._advance(point)]
+        self.running = [point for point in self.running if point not in ended]
+        new = self._submit()
+        self.view.update(self.running, self.source.counts())
+        if self.settings.wait or new or ended:
+            return bool(self.running or new)
+        return False
+
+    def _advance(self, point: RunningPoint) -> bool:
+        end = point.advance(self.executor, self.runs)
+        if end is not None:
+            end = self.source.record(point.task, end)
+            self.view.ended(point, end.state, end.reason)
+        return end is not None
+
+    def _submit(self) -> bool:
+        """Hand free points to the executor, all at once; whether there were any."""
+        tasks = list[Task]()
+        while len(self.running) + len(tasks) < self.executor.slots and not self._is_over():
+            task = self.source.next()
+            if task is None:
+                break
+            tasks.append(task)
+        for run in (run for task in tasks for run in task.plan.runs):
+            if not is_held(self.runs.runs_dir / run.key / "lock"):
+                self.runs.replace_outdated(run.key)
+        works = [work_of(task.plan, self.runs, self.settings.trust) for task in tasks]
+        sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
+        limit_s = 60 * (self.settings.timeout_minutes or math.inf)
+        for task, work, size, job in zip(
+            tasks, works, sizes, self.executor.submit(works) if works else (), strict=True
+        ):
+            self.running.append(RunningPoint(task, job, work.log, size, limit_s))
+            self.view.say("started", task.plan.point.label)
+        self._report_cores()
+        return bool(tasks)
+
+    def _stop(self) -> None:
+        for point in self.running:
+            self.executor.cancel(point.job)
+        while any(self.executor.state(each.job) == "running" for each in self.running):
+            time.sleep(POLL_S)
+
+    def _is_over(self) -> bool:
+        """Whether the time of this call is spent."""
+        return time.monotonic() - self._began > 3600 * (self.settings.hours or math.inf)
+
+    def _report_cores(self) -> None:
+        """Say once that the jobs compute with more threads than this machine has cores."""
+        trainers = [point.task.plan.runs[0].trainer for point in self.running]
+        cores, threads = usable_cores(), sum(trainer.threads for trainer in trainers)
+        is_here = isinstance(self.executor, LocalExecutor)
+        if self._has_reported_cores or not is_here or len(trainers) < 2 or threads <= cores:
+            return
+        self._has_reported_cores = True
+        import torch
+
+        if not torch.accelerator.is_available() or trainers[0].accelerator == "cpu":
+            fitting = max(1, cores * len(trainers) // threads)
+            self.view.say(
+                "note",
+                f"{len(trainers)} runs with trainer.threads={trainers[0].threads} share {cores} "
+                f"cores: more than workers={fitting} gain little.",
+            )
+
+
+def work_of(plan: PlannedPoint, runs: RunStore, trust: str) -> Work:
+    """What a point lacks: trainings, and further evaluations of its runs."""
+    steps = []
+    for run in plan.runs:
+        folder = runs.runs_dir / run.key
+        result = runs.find(run.key, plan.fingerprints[run.key], plan.point.evaluations)
+        if result is None:
+            steps.append(Step((TRAINING, *run.overrides), folder))
+        for words in plan.point.evaluations:
+            if result is None or stored_at(result, words) is None:
+                module, *arguments = command_of(words)
+                arguments += [f"trust={trust}"] if trust else []
+                # The run may come from a machine with other folders.
+                arguments += [word for word in run.overrides if word.startswith(FOLDERS)]
+                steps.append(Step((module, f"run={folder}", *arguments), folder))
+    environment = {TAGS: json.dumps(dict(plan.point.tags)), OWN_FOLDERS: own_folders()}
+    log = runs.runs_dir / LOGS / f"{plan.key}.log"
+    # One command may make several measurements.
+    return Work(plan.key, tuple(dict.fromkeys(steps)), environment, log, Path.cwd())
+
+
+def drive(view: ProgressView, source: Source, runs: RunStore, settings: SweepSettings) -> None:
+    """Execute the points of `source` where the launcher of `settings` says."""
+    from optuna.exceptions import StorageInternalError
+
+    executor = open_executor(settings.launcher, settings.workers, settings.gpus)
+    if not settings.wait and not executor.is_lasting:
+        raise InputError("wait=false: these runs end with the command; SLURM's and Ray's do not.")
+    runs.create_tables()
+    try:
+        with view:
+            Driver(source, runs, executor, settings, view).run()
+    except StorageInternalError as error:
+        raise RunError(f"storage: {str(error).splitlines()[0]}; rerun the command.") from error

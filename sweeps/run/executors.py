@@ -1,0 +1,68 @@
+"""Where the jobs of a study are executed: Hydra's group ``hydra/launcher`` decides."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Protocol
+
+from rgbt.checks import InputError
+from sweeps.run.job import Work
+from sweeps.run.local import LocalExecutor
+from sweeps.settings import GpuSlot, Launcher
+
+# Launchers that work, and the package and the extra that they need.
+LAUNCHERS = {
+    "basic": None,
+    "submitit_local": ("submitit", "slurm"),
+    "submitit_slurm": ("submitit", "slurm"),
+    "ray": ("ray", "ray"),
+}
+
+
+class Executor(Protocol):
+    """Executes points. A job is its name, which another driver of the study understands too."""
+
+    slots: int  # jobs at the same time, queued ones included
+    is_lasting: bool  # whether jobs go on without the driver
+
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        """Start or queue jobs; a point that has one already keeps it. RunError: not possible."""
+
+    def state(self, job: str) -> str:
+        """Return "queued", "running", or how it ended ("ended": see its log and the run folder)."""
+
+    def cancel(self, job: str) -> None:
+        """Remove a job that is queued; let one that runs save its step and end."""
+
+
+def check_launcher(launcher: Launcher) -> None:
+    """InputError: a launcher with which a sweep does not work, or its packages are missing."""
+    name = launcher.name
+    if name not in LAUNCHERS:
+        hint = " Its n_jobs is hydra.sweeper.workers." if name == "joblib" else ""
+        known = ", ".join(LAUNCHERS)
+        raise InputError(f"hydra/launcher={name}: a sweep works with {known}.{hint}")
+    needed = LAUNCHERS[name]
+    if needed is not None and find_spec(needed[0]) is None:
+        raise InputError(f"hydra/launcher={name} needs: pip install 'rgbt[{needed[1]}]'.")
+
+
+def open_executor(
+    launcher: Launcher, workers: int | None, gpus: Sequence[GpuSlot] | None
+) -> Executor:
+    """The executor of a launcher with at most `workers` jobs; InputError as of its settings."""
+    check_launcher(launcher)
+    if gpus is not None and launcher.name != "basic":
+        raise InputError(f"gpus={gpus}: hydra/launcher={launcher.name} chooses the GPUs of a job.")
+    if launcher.name == "basic":
+        return LocalExecutor(workers or 1, gpus)
+    if launcher.name == "ray":
+        from sweeps.run.ray_tasks import RayExecutor
+
+        return RayExecutor(launcher.options, workers or sys.maxsize)
+    from sweeps.run.submitit_jobs import SubmititExecutor
+
+    cluster = launcher.name.removeprefix("submitit_")
+    return SubmititExecutor(cluster, launcher.options, workers)

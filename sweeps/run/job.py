@@ -1,0 +1,186 @@
+"""What a job does on any machine: the commands of a point, each in a process of its own.
+
+A job knows words alone. The run folder says what is done and at which step a run resumes, so that a
+job may be stopped, repeated, or started twice.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from rgbt.files.atomic import is_held
+from rgbt.runs.folder import is_finished
+from rgbt.runtime.group import end_with_parent
+
+TRAINING = "rgbt.run"
+# What a job writes into its log: this, that it started, and how it ended.
+SAYS, STARTED, DONE = "job: ", "started", "done"
+
+
+class Step(NamedTuple):
+    """A command (``python -m <words>``) about a run folder."""
+
+    words: tuple[str, ...]
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Work:
+    """A point as an executor gets it.
+
+    Attributes:
+        key: of the point, unique in the folder of runs.
+        steps: its commands, one after another until one fails.
+        environment: variables that the commands get.
+        log: file to which their output is appended.
+        folder: working folder.
+    """
+
+    key: str
+    steps: tuple[Step, ...]
+    environment: Mapping[str, str]
+    log: Path
+    folder: Path
+
+
+class Child(NamedTuple):
+    """The process of a command; `reap` forgets it when it has ended."""
+
+    pid: int
+    reap: Callable[[], object]
+
+
+class Job:
+    """Executes a point; a callable without a state, which submitit and Ray pickle."""
+
+    poll_s = 0.5
+
+    def __init__(self, work: Work) -> None:
+        self.work = work
+        self.is_stopped = False  # nothing more is started, and the present command is stopped
+        self._child: Child | None = None
+
+    def __reduce__(self) -> tuple[type[Job], tuple[Work]]:
+        return type(self), (self.work,)
+
+    def __call__(self) -> int:
+        """Execute the steps; 0, or the exit code of the one that failed (negative: a signal)."""
+        self.work.log.parent.mkdir(parents=True, exist_ok=True)
+        self._say(f"{STARTED} on {os.uname().nodename}")
+        code = 0
+        try:
+            for step in self.work.steps:
+                code = code or self._execute(step)
+        except BaseException:  # a time limit, or Ray cancels: the run saves its step first
+            self.stop()
+            raise
+        self._say(how_ended(code))
+        return code
+
+    def stop(self) -> None:
+        """Let the present command save and end; returns when it has ended."""
+        self.is_stopped = True
+        if self._child is not None:
+            self._wait(self._child)
+
+    def check(self) -> None:
+        """Called again and again while a command runs."""
+
+    def start(self, words: Sequence[str]) -> Child:
+        """Start a command."""
+        with self.work.log.open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", __name__, *words],
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **self.work.environment},
+                cwd=self.work.folder,
+            )
+        return Child(process.pid, process.wait)
+
+    def _say(self, text: str) -> None:
+        with self.work.log.open("a") as log:
+            log.write(f"{SAYS}{text}\n")
+
+    def _execute(self, step: Step) -> int:
+        lock, is_training = step.folder / "lock", step.words[0] == TRAINING
+        while True:
+            # Another job, or a command of the user, trains the same run: its result is ours.
+            while is_training and is_held(lock) and not self.is_stopped:
+                time.sleep(self.poll_s)
+                self.check()
+            if self.is_stopped:
+                return 128 + signal.SIGTERM
+            if is_training and is_finished(step.folder):
+                return 0
+            self._child = self.start(step.words)
+            code = self._wait(self._child)
+            self._child.reap()
+            self._child = None
+            if code == 0 or not (is_training and is_held(lock)):
+                return code
+
+    def _wait(self, child: Child) -> int:
+        # The process stays known until it is reaped: a handler of a signal may wait for it too.
+        options, is_told = os.WEXITED | os.WNOHANG | os.WNOWAIT, False
+        while (end := os.waitid(os.P_PID, child.pid, options)) is None:
+            if self.is_stopped and not is_told:
+                os.kill(child.pid, signal.SIGTERM)
+                is_told = True
+            time.sleep(self.poll_s)
+            self.check()
+        return end.si_status if end.si_code == os.CLD_EXITED else -end.si_status
+
+
+def how_ended(code: int) -> str:
+    """An exit code in words."""
+    if code >= 0:
+        return f"exit code {code}" if code else DONE
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"stopped by {name}{' (out of memory?)' if name == 'SIGKILL' else ''}"
+
+
+LOST = "its job was lost"
+
+
+def failure_reason(log: Path, begin: int) -> str:
+    """Why a job failed: the last message in its log behind byte `begin`; "": done."""
+    text = log.read_bytes()[begin:].decode(errors="replace") if log.exists() else ""
+    lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+    said = [line.removeprefix(SAYS) for line in lines if line.startswith(SAYS)]
+    ends = [each for each in said if not each.startswith(STARTED)]
+    if not ends:
+        return LOST
+    if ends[-1] == DONE or not ends[-1].startswith("exit code"):
+        return ends[-1].removeprefix(DONE)
+    # Libraries log tracebacks of errors that they handle: the last message counts.
+    others = [line for line in lines if not line.startswith(SAYS)]
+    messages = [line for line in others if re.match(r"rgbt: |[\w.]+(Error|Exception)\b", line)]
+    found = [f"it ended with {ends[-1]} and no output; see {log}", *others[-1:], *messages]
+    return found[-1].removeprefix("rgbt: ")[:300]
+
+
+def become(words: Sequence[str]) -> None:
+    """Become ``python -m <words>``; leaves by SystemExit, or returns."""
+    sys.argv = list(words)
+    sys.orig_argv = [sys.executable, "-m", *words]
+    runpy.run_module(words[0], run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    # Clusters send these to every process of a job; its first one answers.
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
+    end_with_parent(signal.SIGTERM)
+    sys.path.append(str(Path.cwd()))  # last: a user's folder may hold packages of our names
+    become(sys.argv[1:])

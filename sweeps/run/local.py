@@ -1,0 +1,164 @@
+"""Jobs on this machine, forked from a process that has imported torch and MLflow.
+
+That process is Python's fork server. It starts with the first job, so that all runs of a sweep
+execute the code of that moment (`sweeps.run.preload`); no state is carried from run to run.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import FrameType
+
+from rgbt.checks import InputError, RunError
+from rgbt.cores import sleep_while_waiting
+from rgbt.runs.source_code import counted_modules
+from sweeps.run.job import Child, Job, Step, Work, become, failure_reason
+from sweeps.settings import GpuSlot
+
+CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.run.preload"
+GPUS = "CUDA_VISIBLE_DEVICES"
+# Time between SIGTERM and SIGKILL of a job that is cancelled.
+GRACE_S = 20.0
+
+
+class LocalExecutor:
+    """Jobs as processes of this machine, `slots` at a time; the n-th slot sees the n-th `gpus`."""
+
+    is_lasting = False
+
+    def __init__(self, slots: int = 1, gpus: Sequence[GpuSlot] | None = None) -> None:
+        if slots > 1:
+            sleep_while_waiting()
+        check_gpus(gpus)
+        self.slots, self._gpus = slots, gpus
+        self._context = multiprocessing.get_context("forkserver")
+        self._processes: dict[str, BaseProcess] = {}
+        self._of_slot: dict[int, str] = {}
+        self._kill_at: dict[str, float] = {}
+
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        """Start jobs; their names. RunError: the machine starts no process."""
+        return [self._start(work) for work in works]
+
+    def state(self, job: str) -> str:
+        """See `Executor.state`; a job that does not stop in time is killed."""
+        process = self._processes[job]
+        if process.exitcode is None and time.monotonic() > self._kill_at.get(job, float("inf")):
+            _signal(process, signal.SIGKILL)
+        return "running" if process.exitcode is None else "ended"
+
+    def cancel(self, job: str) -> None:
+        """Let the present command save and end, with all that it has started."""
+        self._kill_at.setdefault(job, time.monotonic() + GRACE_S)
+        if self._processes[job].exitcode is None:
+            _signal(self._processes[job], signal.SIGTERM)
+
+    def _start(self, work: Work) -> str:
+        # The user's own modules that planned points have read are imported too. This has no effect
+        # once the server runs.
+        self._context.set_forkserver_preload([CWD_LAST, *counted_modules(), PRELOADED])
+        free = (slot for slot in range(self.slots) if not self._is_busy(slot))
+        slot = next(free, 0)
+        if self._gpus:
+            variables = {GPUS: ",".join(gpus_of(self._gpus[slot % len(self._gpus)]))}
+            work = replace(work, environment={**work.environment, **variables})
+        process = self._context.Process(target=_execute, args=(work,))
+        try:
+            process.start()
+        except OSError as error:
+            raise RunError(f"its process could not be started ({error})") from error
+        job = str(process.pid)
+        self._processes[job], self._of_slot[slot] = process, job
+        return job
+
+    def _is_busy(self, slot: int) -> bool:
+        return slot in self._of_slot and self.state(self._of_slot[slot]) == "running"
+
+
+class ForkedJob(Job):
+    """A job whose commands are forked from this process, and need not import anything again."""
+
+    poll_s = 0.05
+
+    def start(self, words: Sequence[str]) -> Child:
+        """See `Job.start`."""
+        arguments = (tuple(words), dict(self.work.environment), str(self.work.log))
+        process = multiprocessing.get_context("fork").Process(target=_command, args=arguments)
+        process.start()
+        assert process.pid is not None, "a started process has a number"
+        return Child(process.pid, process.join)
+
+
+def _execute(work: Work) -> None:
+    """Execute a job in the process that was forked for it: the leader of a process group."""
+    os.setsid()
+    os.chdir(work.folder)
+    job = ForkedJob(work)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        job.is_stopped = True
+
+    signal.signal(signal.SIGTERM, stop)
+    sys.exit(max(0, job()))
+
+
+def _command(words: Sequence[str], variables: Mapping[str, str], log: str) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.update(variables)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    become(words)
+
+
+def _signal(process: BaseProcess, number: signal.Signals) -> None:
+    assert process.pid is not None, "a started process has a number"
+    with suppress(ProcessLookupError):  # gone already
+        is_leader = os.getpgid(process.pid) == process.pid
+        (os.killpg if is_leader else os.kill)(process.pid, number)
+
+
+def run_command(words: Sequence[str], log: Path) -> str:
+    """Run ``python -m <words>`` to its end; "" or the reason of its failure in one sentence."""
+    begin = log.stat().st_size if log.exists() else 0
+    executor = LocalExecutor()
+    work = Work(log.stem, (Step(tuple(words), log.parent),), {}, log, Path.cwd())
+    (job,) = executor.submit([work])
+    try:
+        while executor.state(job) == "running":
+            time.sleep(0.05)
+    except BaseException:
+        executor.cancel(job)
+        while executor.state(job) == "running":
+            time.sleep(0.05)
+        raise
+    return failure_reason(log, begin)
+
+
+def gpus_of(slot: GpuSlot) -> list[str]:
+    """The GPUs of one entry of `gpus`."""
+    return [str(slot)] if isinstance(slot, int) else list(map(str, slot))
+
+
+def check_gpus(gpus: Sequence[GpuSlot] | None) -> None:
+    """Refuse GPUs that this machine does not have or hides: a run would train on the CPU."""
+    for number in (each for slot in gpus or () for each in gpus_of(slot)):
+        shown = os.environ.get(GPUS)
+        if shown is None:
+            import torch
+
+            shown = ",".join(map(str, range(torch.cuda.device_count())))
+        if number not in [word.strip() for word in shown.split(",")]:
+            raise InputError(f"gpus: no GPU {number}; this machine shows {shown or 'none'}.")

@@ -1,0 +1,135 @@
+"""Jobs as tasks of Ray, which chooses their nodes and GPUs, fractions of a GPU included.
+
+The tasks belong to an actor that outlives the command, so that a driver may end or be killed while
+they run. Ray repeats the task of a lost node on another one, where its run resumes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+import ray
+from annotated_types import Interval
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from rgbt.checks import InputError, RunError, one_line
+from rgbt.config.values import check_value
+from rgbt.terminal import info
+from sweeps.run.job import Job, Work
+
+KEEPER, NAMESPACE = "jobs", "rgbt"
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """Settings of ``conf/hydra/launcher/ray.yaml``, which explains them."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    address: str | None
+    num_gpus: Annotated[float, Interval(ge=0, le=64)] | None
+    num_cpus: Annotated[float, Interval(gt=0, le=1024)]
+    max_retries: Annotated[int, Interval(ge=-1, le=1000)]
+
+
+class Keeper:
+    """The actor: submits tasks and knows their states; a job is named by the log of its point."""
+
+    def __init__(self) -> None:
+        self._tasks: dict[str, Any] = {}
+        self._ends: dict[str, str] = {}
+
+    def submit(self, job: str, work: Work, resources: Mapping[str, Any]) -> None:
+        """Queue a job, unless it is queued or runs."""
+        if self.state(job) not in ("queued", "running"):
+            self._ends.pop(job, None)
+            self._tasks[job] = ray.remote(_execute).options(**resources).remote(work)
+
+    def state(self, job: str) -> str:
+        """See `Executor.state`."""
+        if job not in self._tasks:
+            return self._ends.get(job, "ended")
+        if not ray.wait([self._tasks[job]], timeout=0)[0]:
+            return "running"
+        try:
+            ray.get(self._tasks.pop(job))
+            self._ends[job] = "ended"
+        except Exception as error:  # any error of a task, of its node, or of Ray
+            self._ends[job] = f"lost by Ray: {one_line(error)}"
+        return self._ends[job]
+
+    def cancel(self, job: str) -> None:
+        """See `Executor.cancel`."""
+        if job in self._tasks:
+            ray.cancel(self._tasks[job])
+
+
+class RayExecutor:
+    """Tasks of the Ray cluster at `address`, of one that runs here, or of a new one."""
+
+    def __init__(self, options: Mapping[str, Any], slots: int) -> None:
+        given = {name: value for name, value in options.items() if name != "_target_"}
+        settings: RayOptions = check_value("hydra.launcher", given, RayOptions)
+        self.slots, self.is_lasting = slots, _connect(settings.address)
+        gpus = settings.num_gpus
+        if gpus is None:
+            gpus = 1.0 if ray.cluster_resources().get("GPU") else 0.0
+        self._resources = {
+            "num_gpus": gpus,
+            "num_cpus": settings.num_cpus,
+            "max_retries": settings.max_retries,
+        }
+        self._warn_if_too_large()
+        # On this node, so that the loss of another one does not end it.
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        kept = {"name": KEEPER, "get_if_exists": True, "lifetime": "detached", "num_cpus": 0}
+        self._keeper = ray.remote(Keeper).options(**kept, scheduling_strategy=here).remote()
+
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        """See `Executor.submit`."""
+        jobs = [str(work.log) for work in works]
+        for job, work in zip(jobs, works, strict=True):
+            self._ask("submit", job, work, self._resources)
+        return jobs
+
+    def state(self, job: str) -> str:
+        """See `Executor.state`; a task that waits for resources is "running", too."""
+        return str(self._ask("state", job))
+
+    def cancel(self, job: str) -> None:
+        """See `Executor.cancel`."""
+        self._ask("cancel", job)
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        try:
+            return ray.get(getattr(self._keeper, name).remote(*arguments))
+        except ray.exceptions.RayError as error:
+            raise RunError(f"Ray cannot be reached any more: {one_line(error)}") from error
+
+    def _warn_if_too_large(self) -> None:
+        wanted = {"GPU": self._resources["num_gpus"], "CPU": self._resources["num_cpus"]}
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(all(node.get(n, 0) >= size for n, size in wanted.items()) for node in nodes):
+            info(f"no node of the Ray cluster has {wanted}: runs wait until there is one.")
+
+
+def _connect(address: str | None) -> bool:
+    """Whether there is a cluster; if none runs, and none is named, Ray is started here."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
+    quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": 30}
+    try:
+        ray.init(address or "auto", **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        if address is not None or not isinstance(error, ConnectionError):
+            reason = f"hydra.launcher.address={address}: {one_line(error)}"
+            raise InputError(reason) from error
+        ray.init(include_dashboard=False, **quiet)
+        return False
+    return True
+
+
+def _execute(work: Work) -> int:
+    return Job(work)()

@@ -1,0 +1,172 @@
+"""Jobs of SLURM, or of its substitute on this machine, submitted by submitit.
+
+The settings are those of the published plugin `hydra-submitit-launcher`. submitit queues a job
+again near its time limit and after pre-emption; its run resumes from the step in the run folder.
+"""
+
+from __future__ import annotations
+
+import getpass
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import submitit
+from submitit.core.utils import FailedJobError, FailedSubmissionError
+from submitit.helpers import DelayedSubmission
+
+from rgbt.checks import InputError, RunError, one_line
+from rgbt.files.plain_files import read_json, write_json
+from sweeps.run.job import Job, Work
+
+# Folder in the folder of runs: the job of each point, and files that stop them.
+JOBS = ".jobs"
+# Most jobs of an array that SLURM accepts by default.
+MOST_JOBS = 1000
+# Seconds between two questions to SLURM's controller, which serves all users.
+ASK_S = 5.0
+# Seconds that a job waits for its end after somebody else has stopped its command: SLURM queues a
+# job again that it pre-empts, but not one that ends by itself.
+PREEMPTION_S = 300.0
+
+# Settings of the plugin that submitit takes without the name of the cluster before it.
+SHARED = (
+    *("timeout_min", "cpus_per_task", "gpus_per_node", "tasks_per_node", "mem_gb", "nodes"),
+    *("name", "stderr_to_stdout"),
+)
+
+JOB_ID = re.compile(r"\d+(_\d+)?")
+QUEUED = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "SPECIAL_EXIT")
+RUNNING = ("RUNNING", "COMPLETING", "SUSPENDED", "STOPPED", "SIGNALING", "STAGE_OUT", "RESIZING")
+
+
+class SubmititJob(Job):
+    """A job that a file stops, and that is queued again near its time limit."""
+
+    def __call__(self) -> int:
+        """See `Job`."""
+        code = super().__call__()
+        if code in (-signal.SIGTERM, 128 + signal.SIGTERM) and not self.is_stopped:
+            time.sleep(PREEMPTION_S)
+        return code
+
+    def check(self) -> None:
+        """See `Job.check`."""
+        self.is_stopped = self.is_stopped or stop_file(self.work).exists()
+
+    def checkpoint(self) -> DelayedSubmission:
+        """What is queued again, when the step is saved; submitit calls it for a signal."""
+        self.stop()
+        return DelayedSubmission(SubmititJob(self.work))
+
+
+class SubmititExecutor:
+    """Jobs of a cluster ("slurm"), or of this machine ("local")."""
+
+    def __init__(self, cluster: str, options: Mapping[str, Any], workers: int | None) -> None:
+        self._cluster, self._executor = cluster, _executor(cluster, options)
+        self.is_lasting = cluster == "slurm"
+        self.slots = workers or (MOST_JOBS if cluster == "slurm" else 1)
+        self._works: dict[str, Work] = {}
+        self._jobs: dict[str, Any] = {}  # of this machine: objects of submitit
+        self._states: dict[str, str] = {}
+        self._asked_at = float("-inf")
+
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        """See `Executor.submit`; several jobs are one array."""
+        found = {work.key: self._queued_before(work) for work in works}
+        new = [work for work in works if not found[work.key]]
+        for work in new:
+            stop_file(work).parent.mkdir(parents=True, exist_ok=True)
+            stop_file(work).unlink(missing_ok=True)
+        try:
+            with self._executor.batch(allow_implicit_submissions=True):
+                jobs = [self._executor.submit(SubmititJob(work)) for work in new]
+        except (FailedJobError, FailedSubmissionError, OSError) as error:
+            raise RunError(f"{self._cluster}: {one_line(error)}") from error
+        for work, job in zip(new, jobs, strict=True):
+            found[work.key], self._jobs[job.job_id] = job.job_id, job
+            if self._cluster == "slurm":
+                write_json(record(work), {"job": job.job_id})
+        self._works |= {found[work.key]: work for work in works}
+        self._states |= {job.job_id: "queued" for job in jobs}
+        return [found[work.key] for work in works]
+
+    def state(self, job: str) -> str:
+        """See `Executor.state`; of SLURM with the word of its controller."""
+        if self._cluster == "local":
+            return "ended" if self._jobs[job].done() else "running"
+        if time.monotonic() - self._asked_at > ASK_S:
+            self._asked_at = time.monotonic()
+            with suppress(OSError, subprocess.SubprocessError):  # a controller that is busy
+                self._states = states_of_slurm()
+        return self._states.get(job, "ended")
+
+    def cancel(self, job: str) -> None:
+        """See `Executor.cancel`."""
+        stop_file(self._works[job]).touch()
+        if self._cluster == "slurm":
+            subprocess.run(["scancel", "--quiet", "--state=PENDING", job], check=False)
+            self._asked_at = float("-inf")
+
+    def _queued_before(self, work: Work) -> str:
+        """The job of a point that an earlier driver has submitted and that has not ended; or ""."""
+        if self._cluster != "slurm" or not record(work).is_file():
+            return ""
+        known = read_json(record(work), dict[str, str], "remove it").get("job", "")
+        is_there = JOB_ID.fullmatch(known) and self.state(known) in ("queued", "running")
+        return known if is_there else ""
+
+
+def record(work: Work) -> Path:
+    """The file that names the job of a point."""
+    return work.log.parent.parent / JOBS / f"{work.key}.json"
+
+
+def stop_file(work: Work) -> Path:
+    """The file whose existence stops the job of a point."""
+    return record(work).with_suffix(".stop")
+
+
+def states_of_slurm() -> dict[str, str]:
+    """The jobs of this user and their states; SLURM forgets one some minutes after its end."""
+    command = ("squeue", "--noheader", "--array", "--states=all", "--format=%i|%T")
+    user = f"--user={getpass.getuser()}"
+    text = subprocess.run(
+        [*command, user], check=True, capture_output=True, text=True, timeout=60
+    ).stdout
+    found = dict(line.strip().split("|") for line in text.splitlines() if "|" in line)
+    return {job: _word(state) for job, state in found.items()}
+
+
+def _word(state: str) -> str:
+    if state in QUEUED:
+        return "queued"
+    if state in RUNNING:
+        return "running"
+    return "ended" if state in ("COMPLETED", "FAILED") else state.lower().replace("_", " ")
+
+
+def _executor(cluster: str, options: Mapping[str, Any]) -> submitit.AutoExecutor:
+    given = {name: value for name, value in options.items() if name != "_target_"}
+    for name in ("nodes", "tasks_per_node"):
+        if given.get(name, 1) != 1:
+            raise InputError(
+                f"hydra.launcher.{name}={given[name]}: a job is one process, which starts those of "
+                "trainer.devices itself."
+            )
+    folder, timeouts = given.pop("submitit_folder"), given.pop("max_num_timeout", None)
+    limits = {} if timeouts is None else {f"{cluster}_max_num_timeout": timeouts}
+    try:
+        executor = submitit.AutoExecutor(folder, cluster=cluster, **limits)
+        executor.update_parameters(
+            **{key if key in SHARED else f"{cluster}_{key}": value for key, value in given.items()}
+        )
+    except (RuntimeError, ValueError, TypeError, NameError, AssertionError) as error:
+        raise InputError(f"hydra/launcher=submitit_{cluster}: {one_line(error)}") from error
+    return executor

@@ -1,1 +1,0 @@
-"""Execution of trials: studies, drivers, processes, finished runs."""
