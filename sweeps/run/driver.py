@@ -87,7 +87,10 @@ class Driver:
         return False
 
     def _advance(self, point: RunningPoint) -> bool:
+        was_started, label = point.is_started, point.task.plan.point.label
         end = point.advance(self.executor, self.runs)
+        if point.is_started and not was_started:
+            self.view.say("started", label)
         if end is not None:
             end = self.source.record(point.task, end)
             self.view.ended(point, end.state, end.reason)
@@ -111,7 +114,8 @@ class Driver:
             tasks, works, sizes, self.executor.submit(works) if works else (), strict=True
         ):
             self.running.append(RunningPoint(task, job, work.log, size, limit_s))
-            self.view.say("started", task.plan.point.label)
+            if self.executor.is_lasting:
+                self.view.say("queued", f"{task.plan.point.label}, job {job}")
         self._report_cores()
         return bool(tasks)
 

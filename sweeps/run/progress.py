@@ -66,7 +66,7 @@ class ProgressView:
     def say(self, how: str, text: str) -> None:
         """Print a line; in a terminal, of what is not as it should be alone."""
         is_log = self._bars.disable
-        if is_log or how not in ("started", "finished"):
+        if is_log or how not in ("queued", "started", "finished"):
             clock = f"{time.strftime('%H:%M:%S')} " if is_log else ""
             line = f"{clock}{how:<8} {without_controls(text)}"
             self._bars.console.print(line, markup=False, highlight=False, soft_wrap=True)
