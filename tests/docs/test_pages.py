@@ -64,7 +64,7 @@ def _commands(text: str) -> Iterator[list[str]]:
 
 
 def _composes(words: list[str]) -> None:
-    own = ("-", "hydra", "corruption.", "weights.", "predictions.", "pretrained.")
+    own = ("-", "hydra", "corruption.", "weights.", "predictions.", "pretrained.", "${")
     kept = [
         w for w in readable_paths(words) if not w.startswith(own) and w.rpartition("=")[2] != "x"
     ]
