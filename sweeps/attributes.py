@@ -4,16 +4,13 @@
 KEY = "rgbt.key"  # key of its point, see `PlannedPoint.key`
 RUNS = "rgbt.runs"  # keys of its runs, one per seed
 OVERRIDES = "rgbt.overrides"  # those of `python -m rgbt.run`, without the seeds of replicates
-LABEL = "rgbt.label"  # the point as shown; written after the first heartbeat
-# Why it failed or was pruned. A failed one without it was lost, released or a duplicate: it does
-# not count.
-REASON = "rgbt.reason"
+LABEL = "rgbt.label"  # the point as shown
+REASON = "rgbt.reason"  # why it failed or was pruned
 SECONDS = "rgbt.seconds"  # duration of its runs, all processes together
 RESULTS = "rgbt.results"  # "val/..." and "test/..." scores, mean over its seeds; percent
 PIXELS = "rgbt.pixels"  # size of its images relative to the paper's, which scales ``${px:64}``
 
 # Attributes of a study
-KIND = "rgbt.kind"  # "search", "grid" or "list"
 SIGNATURE = "rgbt.signature"  # hash of its space and objectives, which must not change
 METRICS = "rgbt.metrics"  # names of the objectives, in order
 COMMAND = "rgbt.command"  # the command that created it

@@ -165,9 +165,7 @@ def run_queue(
     if not plans:
         raise InputError(f"table={options.table}: none of them can be trained.")
     queue, title = Queue(plans, runs, planner, options.dry_run), f"tables {options.scale}"
-    points = PointList(
-        title, title, "list", queue.points, runs, planner, more=queue.more, rank=queue.rank
-    )
+    points = PointList(title, title, queue.points, runs, planner, more=queue.more, rank=queue.rank)
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0

@@ -16,7 +16,6 @@ from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir, Trust
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import CommandGroup, PlainCommand
-from rgbt.metrics.names import MIOU
 from rgbt.terminal import info
 from sweeps.new_table import NewOptions, new
 from sweeps.settings import SweepSettings
@@ -60,7 +59,6 @@ class Options:
     wait: Annotated[bool, Help("false (SLURM, Ray): submit what is free, and end")] = True
     stop_jobs: Annotated[bool, Help("true: Ctrl-C stops jobs of SLURM and Ray too")] = False
     commands: Annotated[Path | None, Help("write a command for each missing run, run none")] = None
-    storage: Annotated[str | None, Help("address of Optuna's storage of the study")] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
     trust: Trust = ""
 
@@ -127,8 +125,6 @@ def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings
         node = compose_hydra(["hydra/sweeper=study", *words])
         launcher = read_launcher(node)
     check_launcher(launcher)
-    # What Optuna's own pages show of a table; nothing is chosen by it.
-    node.sweeper.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
     node.sweeper.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
         if key in node.sweeper:

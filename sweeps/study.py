@@ -1,4 +1,4 @@
-"""Report of a study: ``rgbt study name=search/grbm``, also while it runs.
+"""Report of a search: ``rgbt study name=search/grbm``, also while it runs.
 
 Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV. `optuna-dashboard`
 draws it.
@@ -32,8 +32,8 @@ WORDS |= {"RUNNING": "unfinished", "WAITING": "waiting"}
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
 
-# Rows of the tables of best trials, and of points of a grid or list; the CSV has all.
-TOP, POINTS = 10, 50
+# Rows of the table of best trials; the CSV has all.
+TOP = 10
 
 # Scores that are shown also where they are no objective.
 ALWAYS = (metric_names.MIOU, metric_names.VAR)
@@ -50,7 +50,7 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Show the results of a study: best trials, failures, importances."""
+    """Show the results of a search: best trials, failures, importances."""
     del overrides  # none is heeded
     from sweeps.run.optuna_study import known_studies, storage_url, study_folder
 
@@ -69,16 +69,13 @@ class StudyData:
     """A study at one moment.
 
     Attributes:
-        kind: "search", "grid" or "list".
         metrics: names of the objectives, and whether more is better.
         params: names of the parameters.
         frame: trials that count, one a row: trial (its number), state, label, the parameters, the
-            scores in percent, objectives first, seconds, last_step, runs, reason; and the key of
-            the point. NaN: it has none.
+            scores in percent, objectives first, seconds, last_step, runs, reason. NaN: it has none.
     """
 
     study: optuna.Study
-    kind: str
     metrics: Mapping[str, bool]
     params: Sequence[str]
     frame: pd.DataFrame
@@ -112,25 +109,22 @@ class StudyData:
                 "last_step": trial.last_step,
                 "runs": " ".join(notes.get(names.RUNS, ())) or None,
                 "reason": " ".join(notes.get(names.REASON, "").split()) or None,
-                "key": notes.get(names.KEY, trial.number),
             }
             rows.append({name: v for name, v in of_trial.items() if v is not None})
         columns = ["trial", "state", "label", *params, *scores, "seconds", "last_step", "runs"]
-        frame = pd.DataFrame(rows, columns=[*columns, "reason", "key"], dtype=object)
-        kind = str(study.user_attrs.get(names.KIND, "search"))
-        return cls(study, kind, dict(zip(metrics, ways, strict=True)), list(params), frame)
+        frame = pd.DataFrame(rows, columns=[*columns, "reason"], dtype=object)
+        return cls(study, dict(zip(metrics, ways, strict=True)), list(params), frame)
 
     def of_state(self, state: str) -> pd.DataFrame:
-        """The latest trials of each point that are in a state: earlier ones were repeated."""
-        latest = self.frame.drop_duplicates("key", keep="last")
-        return latest[latest["state"] == state] if state else latest
+        """The trials that are in a state."""
+        return self.frame[self.frame["state"] == state]
 
 
 def tables(data: StudyData) -> list[TextTable]:
     """Trials by state, the most important trials, the failed ones; empty tables are left out."""
     counts = data.frame["state"].value_counts()
     row = (str(len(data.frame)), *(str(counts.get(word, 0)) for word in WORDS.values()))
-    title = f"Study {data.study.study_name} ({data.kind})"
+    title = f"Study {data.study.study_name}"
     failed = data.of_state("failed")
     failed = failed.assign(reason=failed["reason"].map(one_line))
     found = [
@@ -142,26 +136,19 @@ def tables(data: StudyData) -> list[TextTable]:
 
 
 def trials_grid(data: StudyData) -> TextTable:
-    """The most important trials with their parameters, scores and runs.
-
-    A search shows the best `TOP` by its objective, or the Pareto front of several objectives; a
-    grid or list shows its points in their order.
-    """
+    """The best `TOP` trials by the objective, or the Pareto front of several objectives."""
     from sweeps.point import short_names
 
     complete, (metric, is_up) = data.of_state("complete"), next(iter(data.metrics.items()))
     best = complete.sort_values(metric, ascending=not is_up, kind="stable")
-    if data.kind != "search":
-        title, shown = f"Points (the first {POINTS})", data.of_state("").head(POINTS)
-    elif len(data.metrics) == 1:
+    if len(data.metrics) == 1:
         way = "highest" if is_up else "lowest"
         title, shown = f"Best trials: {way} {metric}", best.head(TOP)
     else:
         front = [trial.number for trial in data.study.best_trials]
         shown = best[best["trial"].isin(front)]
         title = f"Pareto front: {len(shown)} of {len(complete)} complete trials"
-    is_search = data.kind == "search"
-    what = short_names(data.params) if is_search else {"label": "point", "state": "state"}
+    what = short_names(data.params)
     # Objectives and the scores of `ALWAYS`, validation and test side by side.
     ends = [metric.removeprefix("val/").removeprefix("test/") for metric in data.metrics]
     wanted = [f"{split}{end}" for end in (*ends, *ALWAYS) for split in ("", "val/", "test/")]
@@ -184,8 +171,6 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
     from optuna.importance import get_param_importances
 
     complete = data.of_state("complete")
-    if data.kind != "search":
-        return None, ""
     if len(complete) < MIN_TRIALS:
         return None, f"they need {MIN_TRIALS} complete trials, and there are {len(complete)}."
     varied = [name for name in data.params if complete[name].nunique() > 1]
@@ -238,13 +223,13 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     remarks = [f"Importances: {remark}"] if remark else []
     text = [
         f"# Study {study.study_name}",
-        f"Kind: {data.kind}. Objectives: {', '.join(ways)}.",
+        f"Objectives: {', '.join(ways)}.",
         *([f"Created by `{command}`."] if command else []),
         *(grid.to_markdown() for grid in grids),
         *remarks,
     ]
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
-    every = data.frame.drop(columns="key").to_csv(index=False)
+    every = data.frame.to_csv(index=False)
     write_atomic(out / "trials.csv", every.encode())
     print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
     lines = [("report", str(out / "study.md"))]

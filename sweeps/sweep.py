@@ -6,7 +6,6 @@ In a search a sampler selects the points and a pruner stops bad ones.
 from __future__ import annotations
 
 import re
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -17,7 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Group
 
 from rgbt.checks import InputError, RunError
-from rgbt.runs.provenance import command_line, without_passwords
+from rgbt.runs.provenance import command_line
 from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps import attributes as names
@@ -91,8 +90,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     name = settings.study or _name(config.name, list(grid[0].params), identity)
     tags = {f"rgbt.study/{name}": "grid"}
     points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
-    kind = "list" if settings.points else "grid"
-    _grid(PointList(name, name, kind, points, runs, Planner(base)), settings)
+    _grid(PointList(name, name, points, runs, Planner(base)), settings)
 
 
 def _label(point: Point) -> str:
@@ -136,9 +134,6 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         guess = "" if seconds is None else f", about {duration(seconds)}"
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         return
-    words = [f"name={points.study}", f"runs_dir={points.runs.runs_dir}"]
-    words += [f"storage={without_passwords(settings.storage)}"] if settings.storage else []
-    info(f"study {points.study}: rgbt study {shlex.join(words)}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(
@@ -199,7 +194,7 @@ def search(request: Search, settings: SweepSettings) -> None:
 def _run_trials(request: Search, settings: SweepSettings, identity: str) -> None:
     runs_dir = request.runs.runs_dir
     url = storage_url(settings.storage, runs_dir, request.study)
-    attributes = {names.KIND: "search", names.SIGNATURE: identity}
+    attributes = {names.SIGNATURE: identity}
     samplers = {"sampler": build_sampler(settings.sampler), "pruner": build_pruner(settings.pruner)}
     objectives = settings.objectives
     study = open_study(request.study, open_storage(url), objectives, attributes, **samplers)

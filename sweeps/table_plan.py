@@ -222,5 +222,5 @@ def plan_table(
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
     title, points = f"{name} scale={request.scale}", tuple(request.points())
-    planned = PointList(f"table/{name}", title, "list", points, runs, planner, more)
+    planned = PointList(f"table/{name}", title, points, runs, planner, more)
     return TablePlan(request, judge, planned, more, rows, external)

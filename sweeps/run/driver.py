@@ -98,21 +98,21 @@ class Driver:
 
     def _submit(self) -> bool:
         """Hand free points to the executor, all at once; whether there were any."""
-        tasks = list[Task]()
-        while len(self.running) + len(tasks) < self.executor.slots and not self._is_over():
+        tasks, works = list[Task](), list[Work]()
+        while len(self.running) + len(works) < self.executor.slots and not self._is_over():
             task = self.source.next()
             if task is None:
                 break
-            tasks.append(task)
-        for run in (run for task in tasks for run in task.plan.runs):
-            if not is_held(self.runs.runs_dir / run.key / "lock"):
-                self.runs.replace_outdated(run.key)
-        works = [work_of(task.plan, self.runs, self.settings.trust) for task in tasks]
+            try:
+                works.append(work_of(task.plan, self.runs, self.settings.trust))
+                tasks.append(task)
+            except RunError as error:  # its finished run is of other images
+                self.source.record(task, End("failed", str(error)))
+                self.view.say("failed", f"{task.plan.point.label}: {error}")
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
-        for task, work, size, job in zip(
-            tasks, works, sizes, self.executor.submit(works) if works else (), strict=True
-        ):
+        jobs = self.executor.submit(works) if works else []
+        for task, work, size, job in zip(tasks, works, sizes, jobs, strict=True):
             self.running.append(RunningPoint(task, job, work.log, size, limit_s))
             if self.executor.is_lasting:
                 self.view.say("queued", f"{task.plan.point.label}, job {job}")
@@ -149,10 +149,16 @@ class Driver:
 
 
 def work_of(plan: PlannedPoint, runs: RunStore, trust: str) -> Work:
-    """What a point lacks: trainings, and further evaluations of its runs."""
+    """What a point lacks: trainings, and further evaluations of its runs.
+
+    Finished runs of other code that ``fresh=true`` trains again are moved out of the way. RunError:
+    a finished run is of other images.
+    """
     steps = []
     for run in plan.runs:
         folder = runs.runs_dir / run.key
+        if not is_held(folder / "lock"):
+            runs.replace_outdated(run.key)
         result = runs.find(run.key, plan.fingerprints[run.key], plan.point.evaluations)
         if result is None:
             steps.append(Step((TRAINING, *run.overrides), folder))
@@ -164,9 +170,13 @@ def work_of(plan: PlannedPoint, runs: RunStore, trust: str) -> Work:
                 arguments += [word for word in run.overrides if word.startswith(FOLDERS)]
                 steps.append(Step((module, f"run={folder}", *arguments), folder))
     environment = {TAGS: json.dumps(dict(plan.point.tags)), OWN_FOLDERS: own_folders()}
-    log = runs.runs_dir / LOGS / f"{plan.key}.log"
     # One command may make several measurements.
-    return Work(plan.key, tuple(dict.fromkeys(steps)), environment, log, Path.cwd())
+    return Work(plan.key, tuple(dict.fromkeys(steps)), environment, log_of(plan, runs), Path.cwd())
+
+
+def log_of(plan: PlannedPoint, runs: RunStore) -> Path:
+    """The file with the output of the jobs of a point."""
+    return runs.runs_dir / LOGS / f"{plan.key}.log"
 
 
 def drive(view: ProgressView, source: Source, runs: RunStore, settings: SweepSettings) -> None:

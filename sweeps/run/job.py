@@ -151,23 +151,38 @@ def how_ended(code: int) -> str:
 
 
 LOST = "its job was lost"
+# Exit codes of a command that a signal has stopped, which resumes.
+STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 
 
 def failure_reason(log: Path, begin: int) -> str:
     """Why a job failed: the last message in its log behind byte `begin`; "": done."""
     text = log.read_bytes()[begin:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
-    said = [line.removeprefix(SAYS) for line in lines if line.startswith(SAYS)]
-    ends = [each for each in said if not each.startswith(STARTED)]
-    if not ends:
-        return LOST
-    if ends[-1] == DONE or not ends[-1].startswith("exit code"):
-        return ends[-1].removeprefix(DONE)
+    end = _end(lines)
+    if not end.startswith("exit code"):
+        return end.removeprefix(DONE)
     # Libraries log tracebacks of errors that they handle: the last message counts.
     others = [line for line in lines if not line.startswith(SAYS)]
     messages = [line for line in others if re.match(r"rgbt: |[\w.]+(Error|Exception)\b", line)]
-    found = [f"it ended with {ends[-1]} and no output; see {log}", *others[-1:], *messages]
+    found = [f"it ended with {end} and no output; see {log}", *others[-1:], *messages]
     return found[-1].removeprefix("rgbt: ")[:300]
+
+
+def failed_before(log: Path) -> str:
+    """Why the last job with this log failed by itself; "": it did not, or nobody stopped it."""
+    if not log.exists():
+        return ""
+    begin = log.read_bytes().rfind(f"{SAYS}{STARTED}".encode())
+    end = _end(log.read_bytes()[max(0, begin) :].decode(errors="replace").splitlines())
+    failed = end.startswith("exit code") and end not in STOPPED
+    return failure_reason(log, max(0, begin)) if failed else ""
+
+
+def _end(lines: Sequence[str]) -> str:
+    said = [line.removeprefix(SAYS) for line in lines if line.startswith(SAYS)]
+    ends = [each for each in said if not each.startswith(STARTED)]
+    return ends[-1] if ends else LOST
 
 
 def become(words: Sequence[str]) -> None:

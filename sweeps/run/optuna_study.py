@@ -1,8 +1,4 @@
-"""The study of a sweep in Optuna's storage, which its driver alone opens.
-
-A list stores what has ended, for `rgbt study` and for the failures that are not repeated. A search
-asks the sampler for points. What is finished, the run folders say.
-"""
+"""The study of a search in Optuna's storage, which its driver alone opens."""
 
 from __future__ import annotations
 
@@ -83,7 +79,7 @@ def open_study(
 ) -> optuna.Study:
     """The study called `name`, created if it does not exist; with `sampler` and `pruner`.
 
-    InputError: there is one with other objectives, points of another kind or another space.
+    InputError: there is one with other objectives or another space.
     """
     import optuna
 
@@ -93,7 +89,7 @@ def open_study(
     )
     metrics = [objective.metric for objective in objectives]
     wanted, known = {names.METRICS: metrics, **attributes}, study.user_attrs
-    for fixed in (names.METRICS, names.KIND, names.SIGNATURE):
+    for fixed in (names.METRICS, names.SIGNATURE):
         if fixed in known and known[fixed] != wanted.get(fixed):
             what = fixed.removeprefix("rgbt.")
             raise InputError(f"study={name}: one with other {what} exists; choose another name.")
@@ -118,17 +114,6 @@ def known_studies(storage: str | None, runs_dir: Path) -> dict[str, optuna.Study
             known = [study.study_name for study in opened.get_all_studies()]
             found |= {each: optuna.load_study(study_name=each, storage=opened) for each in known}
     return found
-
-
-def add_trial(
-    study: optuna.Study, attributes: Mapping[str, Any], end: End, objectives: Sequence[Objective]
-) -> None:
-    """Add a point of a list that has ended."""
-    from optuna.trial import TrialState, create_trial
-
-    state = TrialState.COMPLETE if end.state == "finished" else TrialState.FAIL
-    values = values_of(end, objectives)
-    study.add_trial(create_trial(state=state, values=values, user_attrs=dict(attributes)))
 
 
 def values_of(end: End, objectives: Sequence[Objective]) -> list[float] | None:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
@@ -17,25 +16,15 @@ from rgbt.files.atomic import is_held, write_atomic
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
-from sweeps import attributes as names
 from sweeps.point import UNFINISHED, Outcome, Point, varied_keys
-from sweeps.run.driver import drive, work_of
-from sweeps.run.optuna_study import (
-    add_trial,
-    driving,
-    known_studies,
-    open_storage,
-    open_study,
-    storage_url,
-)
+from sweeps.run.driver import drive, log_of, work_of
+from sweeps.run.job import failed_before
+from sweeps.run.optuna_study import driving
 from sweeps.run.planner import PlannedPoint, Planner
 from sweeps.run.progress import ProgressView, bars
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import End, Task
 from sweeps.settings import SweepSettings
-
-if TYPE_CHECKING:
-    import optuna
 
 
 @dataclass(frozen=True)
@@ -44,7 +33,6 @@ class PointList:
 
     Attributes:
         title: shown above the progress.
-        kind: "grid" or "list".
         runs: finished runs; the points' overrides name the same folder.
         planner: plans them, with the overrides that all have.
         more: further points, from the outcomes until now; requested when no point is waiting.
@@ -54,7 +42,6 @@ class PointList:
 
     study: str
     title: str
-    kind: str
     points: tuple[Point, ...]
     runs: RunStore
     planner: Planner
@@ -65,22 +52,20 @@ class PointList:
 class ListSource:
     """Plans the points of a list and gives them in their order; equal points are one.
 
-    `study` gets what ends, and says what failed before; of a preview (`is_dry`) nothing is written,
-    and None is a study that does not exist yet. With `strict`, one wrong point is refused, and not
-    only a list of wrong points.
+    With `strict`, one wrong point is refused, and not only a list of wrong points. In a preview
+    (`is_dry`), nothing is written.
     """
 
     def __init__(
         self,
         points: PointList,
         settings: SweepSettings,
-        study: optuna.Study | None,
         *,
         strict: bool = False,
         is_dry: bool = False,
     ) -> None:
-        self._list, self._settings, self._strict = points, settings, strict
-        self._study = None if is_dry else study
+        self._list, self._settings = points, settings
+        self._strict, self._is_dry = strict, is_dry
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}
         self.errors: dict[int, str] = {}
@@ -88,14 +73,7 @@ class ListSource:
         self._same: dict[str, list[int]] = {}
         self._running: set[str] = set()  # keys
         self._finished: dict[str, tuple[RunResult, ...]] = {}
-        self._recorded: set[str] = set()  # keys of finished points that the study has
-        self._failed: dict[str, str] = {}  # key -> reason
-        for trial in study.get_trials(deepcopy=False) if study else ():
-            key = trial.user_attrs.get(names.KEY, "")
-            if trial.state.name == "COMPLETE":
-                self._recorded.add(key)
-            elif settings.retry == "none":
-                self._failed[key] = str(trial.user_attrs.get(names.REASON))
+        self._failed: dict[str, str] = {}  # key -> reason, or "": not in this command or before
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -155,17 +133,17 @@ class ListSource:
         """See `Source.record`."""
         key = task.plan.key
         self._running.discard(key)
+        self._failed[key] = end.reason
         if end.state == "finished":
             self._finished[key] = end.results
-        else:
-            self._failed[key] = end.reason
-        return self._record(task.plan, end)
+        return end
 
     def counts(self) -> Counter[str]:
         """See `Source.counts`; a state is as it was when it was looked at."""
         keys = set(self._same)
         found = Counter(finished=len(keys & set(self._finished)), running=len(self._running))
-        found["failed"] = len((keys & set(self._failed)) - set(self._finished) - self._running)
+        failed = {key for key, reason in self._failed.items() if reason}
+        found["failed"] = len((keys & failed) - set(self._finished) - self._running)
         found["waiting"] = len(keys) - found.total()
         return found
 
@@ -194,32 +172,25 @@ class ListSource:
         return iter(sorted(plans, key=lambda plan: rank(plan.point), reverse=True))
 
     def _outcome(self, plan: PlannedPoint) -> Outcome:
-        """The state of a point by its run folders, and by what failed before."""
+        """The state of a point by its run folders, and by the log of a job that failed."""
+        key, runs = plan.key, self._list.runs
         outcome = Outcome(plan.point, "waiting", keys=tuple(run.key for run in plan.runs))
-        if plan.key in self._running:
+        if key in self._running:
             return replace(outcome, state="running")
-        if plan.key not in self._finished:
-            results = finished_runs(plan, self._list.runs)
+        if key not in self._finished:
+            results = finished_runs(plan, runs)
             if plan.is_evaluated(results):
-                self._finished[plan.key] = results
-                self._record(plan, End("finished", results=results))
-        if plan.key in self._finished:
-            return replace(outcome, state="finished", results=self._finished[plan.key])
-        if plan.key in self._failed:
-            return replace(outcome, state="failed", reason=self._failed[plan.key])
+                self._finished[key] = results
+                for result in () if self._is_dry else results:
+                    runs.tag(result, plan.point.tags)
+        if key in self._finished:
+            return replace(outcome, state="finished", results=self._finished[key])
+        if key not in self._failed:
+            is_retried = self._settings.retry == "failed"
+            self._failed[key] = "" if is_retried else failed_before(log_of(plan, runs))
+        if self._failed[key]:
+            return replace(outcome, state="failed", reason=self._failed[key])
         return outcome
-
-    def _record(self, plan: PlannedPoint, end: End) -> End:
-        """Add a trial to the study, one for a finished point; the end as it counts."""
-        end = end.checked(self._settings.objectives)
-        if self._study is None or (plan.key in self._recorded and end.state == "finished"):
-            return end
-        for result in end.results:
-            self._list.runs.tag(result, plan.point.tags)
-        if end.state == "finished":
-            self._recorded.add(plan.key)
-        add_trial(self._study, {**plan.attributes, **end.notes()}, end, self._settings.objectives)
-        return end
 
 
 def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
@@ -232,10 +203,7 @@ def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
 
 def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     """The present state of the points; nothing is run and nothing written."""
-    runs_dir = points.runs.runs_dir
-    url = storage_url(settings.storage, runs_dir, points.study)
-    study = known_studies(url, runs_dir).get(points.study)
-    return ListSource(points, settings, study, is_dry=True).outcomes(preview=True)
+    return ListSource(points, settings, is_dry=True).outcomes(preview=True)
 
 
 def run_points(
@@ -246,17 +214,13 @@ def run_points(
     None: another process drives the study, which is said.
 
     Raises:
-        InputError: the storage or the executor cannot be used, all points have a wrong
+        InputError: the executor cannot be used, all points have a wrong
             configuration, or with `strict` one of them.
     """
-    runs_dir = points.runs.runs_dir
-    with driving(runs_dir, points.study) as is_ours:
+    with driving(points.runs.runs_dir, points.study) as is_ours:
         if not is_ours:
             return None
-        storage = open_storage(storage_url(settings.storage, runs_dir, points.study))
-        attributes = {names.KIND: points.kind}
-        study = open_study(points.study, storage, settings.objectives, attributes)
-        source = ListSource(points, settings, study, strict=strict)
+        source = ListSource(points, settings, strict=strict)
         for index, reason in source.errors.items():  # before hours of training
             label = points.points[index].label
             info(f"{label}: {reason.removeprefix(f'{label}: ')}")
@@ -266,7 +230,7 @@ def run_points(
 
 def commands_line(points: PointList, settings: SweepSettings) -> str:
     """Write a line of shell for every point that is not finished; what was done, in a sentence."""
-    source, lines = ListSource(points, settings, None, is_dry=True), list[str]()
+    source, lines = ListSource(points, settings, is_dry=True), list[str]()
     while (task := source.next()) is not None:
         work = work_of(task.plan, points.runs, settings.trust)
         variables = [f"{name}={value}" for name, value in work.environment.items() if value]
