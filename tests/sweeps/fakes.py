@@ -1,38 +1,39 @@
-"""Fakes of everything that trains: plans, runs, processes, a driver and its view."""
+"""Fakes of everything that trains: plans, runs, jobs, and what runs a list or a search of them."""
 
 from __future__ import annotations
 
 import hashlib
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
+import optuna
 import pytest
-import sqlalchemy
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
-from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps import attributes as names
 from sweeps.evaluation import Words, measurement_of
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
+from sweeps.run import driver as drivers
+from sweeps.run import point_list
+from sweeps.run.job import SAYS, STARTED, TRAINING, Work, how_ended
+from sweeps.run.optuna_study import open_study
+from sweeps.run.planner import PlannedPoint
+from sweeps.run.point_list import PointList
+from sweeps.run.run_store import RunStore
+from sweeps.run.running_point import RunningPoint
+from sweeps.run.search_source import SearchSource
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space import build_sampler, parse_space
-from sweeps.run import driver as drivers
-from sweeps.run.driver import Driver
-from sweeps.run.planner import PlannedPoint
-from sweeps.run.point_list import ListSource, PointList
-from sweeps.run.run_store import RunStore
-from sweeps.run.running_trial import RunningTrial
-from sweeps.run.storage import STALE_S, TrialStore, open_storage, open_study
-from sweeps.run.trial_sources import SamplerSource
 from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"
@@ -42,12 +43,12 @@ DEADLINE_S = 180.0
 
 def settings(**changes: Any) -> SweepSettings:
     """Settings of a sweep, as in study.yaml but for `changes`."""
-    none = ("storage", "gpus", "timeout_minutes", "study", "pruner", "trials")
+    none = ("storage", "workers", "gpus", "timeout_minutes", "commands", "study", "pruner")
     plain: dict[str, Any] = {
-        **dict.fromkeys((*none, "hours")),
-        "workers": 1,
+        **dict.fromkeys((*none, "trials", "hours")),
         "retry": "none",
-        "wait": False,
+        "wait": True,
+        "stop_jobs": False,
         "dry_run": False,
         "params": {},
         "points": (),
@@ -97,13 +98,6 @@ class FakePlanner:
         return plan_of(point)
 
 
-class PickyPlanner:
-    """Takes no point."""
-
-    def plan(self, point: Point) -> PlannedPoint:
-        raise InputError("x does not fit.")
-
-
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:
     """One image of one region and two classes."""
     array = np.array([[[[right, 4 - right], [0, 4]]]])
@@ -150,17 +144,15 @@ def finish(
     return run
 
 
-@dataclass
+@dataclass(frozen=True)
 class Call:
-    """A requested process, and the folder of the run that it trains."""
+    """A command of a job, and the folder of its run; `attempt` counts equal ones before."""
 
     module: str
     words: tuple[str, ...]
-    environment: dict[str, str]
-    log: Path
     folder: Path
+    log: Path
     attempt: int
-    stops: int = 0
 
     def value(self, name: str) -> str:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
@@ -216,7 +208,7 @@ def hang(call: Call) -> Generator[None, None, NoReturn]:
 
 
 def first(*behaviours: Behaviour) -> Behaviour:
-    """The n-th process of a run behaves as the n-th says; later ones as the last."""
+    """The n-th command of a run behaves as the n-th says; later ones as the last."""
     return lambda call: behaviours[min(call.attempt, len(behaviours) - 1)](call)
 
 
@@ -228,178 +220,205 @@ def only(word: str, behaviour: Behaviour, others: Behaviour = succeed) -> Behavi
 class FakeJob:
     """Goes one step further with every look at it."""
 
-    def __init__(self, call: Call, process: Process) -> None:
-        self.call = call
-        self._process = process
-        self._code: int | None = None
+    def __init__(self, work: Work, executor: FakeExecutor) -> None:
+        self.work, self.is_stopped, self.end = work, False, ""
+        self._executor, self._process = executor, self._execute()
 
-    def poll(self) -> int | None:
-        if self._code is None and self.call.stops:
-            self._code = -15
-        if self._code is None:
+    def _say(self, text: str) -> None:
+        self.work.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.work.log.open("a") as log:
+            log.write(f"{SAYS}{text}\n")
+
+    def _execute(self) -> Generator[None, None, None]:
+        self._say(f"{STARTED} on fake")
+        code = 0
+        for step in self.work.steps:
+            module, *words = step.words
+            if module != TRAINING or not is_finished(step.folder):
+                attempt = self._executor.started().count(tuple(words))
+                call = Call(module, tuple(words), step.folder, self.work.log, attempt)
+                self._executor.calls.append(call)
+                code = yield from self._executor.behaviour(call)
+            if code:
+                break
+        self._say(how_ended(code))
+
+    def look(self) -> str:
+        if self.is_stopped and not self.end:
+            self._say(how_ended(143))
+            self.end = "ended"
+        if not self.end:
             try:
                 next(self._process)
-            except StopIteration as end:
-                self._code = end.value
-        return self._code
-
-    def stop(self) -> None:
-        self.call.stops += 1
+            except StopIteration:
+                self.end = "ended"
+        return self.end or "running"
 
 
 class FakeExecutor:
-    """Makes fake processes; `calls` are all requested ones, in order."""
+    """Simulates jobs; `submits` are the keys of every submission, `calls` all commands."""
 
-    def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed) -> None:
-        self.runs_dir = runs_dir
-        self.behaviour = behaviour
+    def __init__(self, behaviour: Behaviour = succeed, slots: int = 1) -> None:
+        self.behaviour, self.slots, self.is_lasting = behaviour, slots, False
+        self.is_full = False  # whether jobs wait
+        self.submits: list[list[str]] = []
         self.calls: list[Call] = []
-        self.jobs: list[FakeJob] = []
+        self.jobs: dict[str, FakeJob] = {}
 
-    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> FakeJob:
-        module, *words = command
-        folder = self.runs_dir / key_of(words)
-        attempt = sum(call.words == tuple(words) for call in self.calls)
-        call = Call(module, tuple(words), dict(environment), log, folder, attempt)
-        self.calls.append(call)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.touch()
-        self.jobs.append(FakeJob(call, self.behaviour(call)))
-        return self.jobs[-1]
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        self.submits.append([work.key for work in works])
+        return [self._job(work) for work in works]
+
+    def _job(self, work: Work) -> str:
+        for job, known in self.jobs.items():
+            if self.is_lasting and known.work.key == work.key and not known.end:
+                return job
+        job = str(len(self.jobs))
+        self.jobs[job] = FakeJob(work, self)
+        return job
+
+    def state(self, job: str) -> str:
+        is_queued = self.is_full and not self.jobs[job].is_stopped
+        return "queued" if is_queued else self.jobs[job].look()
+
+    def cancel(self, job: str) -> None:
+        self.jobs[job].is_stopped = True
 
     def started(self) -> list[tuple[str, ...]]:
         return [call.words for call in self.calls]
 
+    def stopped(self) -> list[str]:
+        return [name for name, job in self.jobs.items() if job.is_stopped]
 
-Look = Callable[[Sequence[RunningTrial]], None]
+
+def lasting(behaviour: Behaviour = succeed, slots: int = 9) -> FakeExecutor:
+    """A cluster: its jobs go on without the driver."""
+    made = FakeExecutor(behaviour, slots)
+    made.is_lasting = True
+    return made
+
+
+Look = Callable[[Sequence[RunningPoint]], object]
 
 
 class FakeView:
-    """Records its calls; `look` is called at every update with the works."""
+    """Records its calls; `look` is called at every update with the running points."""
 
-    def __init__(self, look: Look = lambda works: None) -> None:
+    def __init__(self, look: Look = len) -> None:
         self.ends: list[tuple[str, str, str]] = []
         self.said: list[tuple[str, str]] = []
-        self.update = look
+        self.counts: list[Mapping[str, int]] = []
+        self._look = look
 
-    def ended(self, work: RunningTrial, how: str, reason: str) -> None:
-        self.ends.append((work.plan.point.label, how, reason))
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def ended(self, point: RunningPoint, how: str, reason: str) -> None:
+        self.ends.append((point.task.plan.point.label, how, reason))
 
     def say(self, how: str, text: str) -> None:
         self.said.append((how, text))
 
+    def update(self, running: Sequence[RunningPoint], counts: Mapping[str, int]) -> None:
+        self.counts.append(dict(counts))
+        self._look(running)
 
-def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
+
+def interrupt_when(condition: Look) -> FakeView:
     """A view that acts like a user who presses Ctrl-C."""
 
-    def look(works: Sequence[RunningTrial]) -> None:
-        if condition(works):
+    def look(running: Sequence[RunningPoint]) -> None:
+        if condition(running):
             raise KeyboardInterrupt
 
     return FakeView(look)
 
 
-@dataclass
-class Desk:
-    """A driver with all that it needs; `plans` are those of a list."""
+@contextmanager
+def driven_by(executor: FakeExecutor, view: FakeView) -> Any:
+    """Drivers have this executor and this view, and look again at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drivers, "POLL_S", 0.0)
+        patch.setattr(drivers, "open_executor", lambda *_: executor)
+        patch.setattr(point_list, "ProgressView", lambda _: view)
+        yield
 
-    driver: Driver
-    store: TrialStore
-    executor: FakeExecutor
-    runs: RunStore
-    view: FakeView
-    plans: list[PlannedPoint] = field(default_factory=list)
 
-    @property
-    def source(self) -> Any:
-        return self.driver.source
+class ListDesk:
+    """A list of points, or so many (x=0, x=1, ...), with all that it needs."""
 
-    def run(self) -> Desk:
-        self.driver.run()
+    def __init__(
+        self,
+        runs_dir: Path,
+        given: Sequence[Point] | int,
+        behaviour: Behaviour = succeed,
+        *,
+        executor: FakeExecutor | None = None,
+        view: FakeView | None = None,
+        slots: int = 1,
+        study: str = "study",
+        planner: Any = None,
+        more: Any = None,
+        rank: Any = None,
+        **changes: Any,
+    ) -> None:
+        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
+        self.executor = executor or FakeExecutor(behaviour, slots)
+        self.view = view or FakeView()
+        self.given = tuple(points(given) if isinstance(given, int) else given)
+        self.planner = planner or FakePlanner()
+        what = (self.given, self.runs, self.planner, more, rank)
+        self.points = PointList(study, study, *what)
+        self.outcomes: list[Outcome] | None = None
+
+    def run(self, *, strict: bool = False) -> ListDesk:
+        with driven_by(self.executor, self.view):
+            self.outcomes = point_list.run_points(self.points, self.settings, strict=strict)
         return self
 
-    def states(self) -> dict[str, list[str]]:
-        """States of trials that count, by label of the point."""
-        found: dict[str, list[str]] = {}
-        for trial in self.store.trials():
-            found.setdefault(trial.user_attrs["rgbt.label"], []).append(trial.state.name)
-        return found
-
-    def numbers(self, state: str) -> list[int]:
-        return [trial.number for trial in self.store.trials() if trial.state.name == state]
+    def states(self) -> dict[str, str]:
+        return {each.point.label: each.state for each in self.outcomes or ()}
 
 
-def memory() -> Any:
-    """A storage of its own, of one thread."""
-    return open_storage("sqlite://", Path("unused"))
+class SearchDesk:
+    """A search over x in 0..1, or over `space`, with all that it needs."""
 
+    def __init__(
+        self,
+        runs_dir: Path,
+        behaviour: Behaviour = succeed,
+        *,
+        executor: FakeExecutor | None = None,
+        view: FakeView | None = None,
+        slots: int = 1,
+        space: Mapping[str, Any] | None = None,
+        storage: Any = None,
+        planner: Any = None,
+        pruner: Any = None,
+        **changes: Any,
+    ) -> None:
+        self.runs = RunStore(runs_dir, NoTracking())
+        self.settings = settings(pruner=pruner and {"_target_": "given"}, **changes)
+        self.executor = executor or FakeExecutor(behaviour, slots)
+        self.view, self.storage = view or FakeView(), storage or optuna.storages.InMemoryStorage()
+        both = {"sampler": build_sampler(self.settings.sampler), "pruner": pruner}
+        self.study = open_study("study", self.storage, self.settings.objectives, {}, **both)
+        searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
+        given = ((), searched, self.study, self.settings, self.view.say)
+        self.source = SearchSource(*given, planner or FakePlanner())
 
-def store_on(
-    storage: Any, wanted: SweepSettings | None = None, kind: str = "list", **study: Any
-) -> TrialStore:
-    """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
-    objectives = (wanted or settings()).objectives
-    began = open_study("study", storage, objectives, {names.KIND: kind}, **study)
-    return TrialStore(began, storage)
+    def run(self) -> SearchDesk:
+        with driven_by(self.executor, self.view):
+            drivers.drive(self.view, self.source, self.runs, self.settings)  # type: ignore[arg-type]
+        return self
 
+    @property
+    def trials(self) -> list[Any]:
+        return self.study.get_trials(deepcopy=False)
 
-def silence(storage: Any, seconds: float = 2 * STALE_S) -> None:
-    """No trial was heard of for so long."""
-    change = f"UPDATE trial_heartbeats SET heartbeat = datetime('now', '-{seconds} seconds')"
-    with storage.engine.begin() as connection:
-        connection.execute(sqlalchemy.text(change))
-
-
-def list_desk(
-    runs_dir: Path,
-    given: Sequence[Point],
-    behaviour: Behaviour = succeed,
-    *,
-    storage: Any = None,
-    view: FakeView | None = None,
-    more: Any = None,
-    **changes: Any,
-) -> Desk:
-    """A driver of a list of points, which are planned."""
-    wanted, runs = settings(**changes), RunStore(runs_dir, NoTracking())
-    wished = PointList("study", "s", "list", tuple(given), runs, FakePlanner(), more)  # type: ignore[arg-type]
-    source = ListSource(wished, wanted)
-    source.store = store_on(memory() if storage is None else storage, wanted)
-    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
-    return Desk(driver, source.store, executor, runs, seen, [plan_of(point) for point in given])
-
-
-def search_desk(
-    runs_dir: Path,
-    behaviour: Behaviour = succeed,
-    *,
-    space: Mapping[str, Any] | None = None,
-    storage: Any = None,
-    view: FakeView | None = None,
-    planner: Any = None,
-    pruner: Any = None,
-    **changes: Any,
-) -> Desk:
-    """A driver of a search over x in 0..1, or over `space`."""
-    wanted = settings(pruner=None if pruner is None else {"_target_": "given"}, **changes)
-    sampler = build_sampler(wanted.sampler)
-    storage = memory() if storage is None else storage
-    store = store_on(storage, wanted, "search", sampler=sampler, pruner=pruner)
-    runs = RunStore(runs_dir, NoTracking())
-    searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
-    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    planner = planner or FakePlanner()
-    source = SamplerSource((), searched, store, planner, wanted, seen.say)
-    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
-    return Desk(driver, store, executor, runs, seen)
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drivers that look again at once."""
-    monkeypatch.setattr(drivers, "POLL_S", 0.001)
-    monkeypatch.setattr(drivers, "CLAIM_S", 0.002)
+    def states(self) -> list[str]:
+        return [trial.state.name for trial in self.trials]
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:
