@@ -103,12 +103,13 @@ class Driver:
             task = self.source.next()
             if task is None:
                 break
-            try:
-                works.append(work_of(task.plan, self.runs, self.settings.trust))
+            work, end = self._look(task)
+            if work is None:
+                self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
+                self.source.record(task, end)
+            else:
+                works.append(work)
                 tasks.append(task)
-            except RunError as error:  # its finished run is of other images
-                self.source.record(task, End("failed", str(error)))
-                self.view.say("failed", f"{task.plan.point.label}: {error}")
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
         jobs = self.executor.submit(works) if works else []
@@ -118,6 +119,17 @@ class Driver:
                 self.view.say("queued", f"{task.plan.point.label}, job {job}")
         self._report_cores()
         return bool(tasks)
+
+    def _look(self, task: Task) -> tuple[Work | None, End]:
+        """What a point lacks; None: nothing, and how it ended."""
+        try:
+            work = work_of(task.plan, self.runs, self.settings.trust)
+            results = () if work.steps else self.runs.of_point(task.plan)
+        except RunError as error:  # its finished run is of other images
+            return None, End("failed", str(error))
+        for result in results:
+            self.runs.tag(result, task.plan.point.tags)
+        return (work if work.steps else None), End("finished", results=results)
 
     def _stop(self) -> None:
         for point in self.running:
