@@ -127,9 +127,14 @@ class Driver:
             results = () if work.steps else self.runs.of_point(task.plan)
         except RunError as error:  # its finished run is of other images
             return None, End("failed", str(error))
+        if work.steps:
+            return work, End("finished")
+        # Its job ended while no driver looked.
+        RunningPoint(task, "", work.log, 0).read(self.runs.runs_dir)
         for result in results:
             self.runs.tag(result, task.plan.point.tags)
-        return (work if work.steps else None), End("finished", results=results)
+        seconds = sum(result.result.get("seconds_of_last_process", 0.0) for result in results)
+        return None, End("finished", results=results, seconds=round(seconds, 1))
 
     def _stop(self) -> None:
         for point in self.running:
