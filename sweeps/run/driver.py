@@ -61,6 +61,7 @@ class Driver:
 
     def __post_init__(self) -> None:
         self._began, self._has_reported_cores = time.monotonic(), False
+        self._is_drained = False  # the source has nothing more until a point ends
 
     def run(self) -> None:
         """Execute points until none is left; with ``wait=false`` until all free ones are queued.
@@ -79,6 +80,7 @@ class Driver:
     def _step(self) -> bool:
         """Look at all jobs, and submit new ones; whether there is more to do."""
         ended = [point for point in self.running if self._advance(point)]
+        self._is_drained = self._is_drained and not ended
         self.running = [point for point in self.running if point not in ended]
         new = self._submit()
         self.view.update(self.running, self.source.counts())
@@ -100,7 +102,8 @@ class Driver:
         """Hand free points to the executor, all at once; whether there were any."""
         tasks, works = list[Task](), list[Work]()
         while len(self.running) + len(works) < self.executor.slots and not self._is_over():
-            task = self.source.next()
+            task = None if self._is_drained else self.source.next()
+            self._is_drained = task is None
             if task is None:
                 break
             work, end = self._look(task)
