@@ -146,13 +146,12 @@ def finish(
 
 @dataclass(frozen=True)
 class Call:
-    """A command of a job, and the folder of its run; `attempt` counts equal ones before."""
+    """A command of a job, and the folder of its run."""
 
     module: str
     words: tuple[str, ...]
     folder: Path
     log: Path
-    attempt: int
 
     def value(self, name: str) -> str:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
@@ -207,9 +206,10 @@ def hang(call: Call) -> Generator[None, None, NoReturn]:
         yield
 
 
-def first(*behaviours: Behaviour) -> Behaviour:
-    """The n-th command of a run behaves as the n-th says; later ones as the last."""
-    return lambda call: behaviours[min(call.attempt, len(behaviours) - 1)](call)
+def nth(*behaviours: Behaviour) -> Behaviour:
+    """The n-th command behaves as the n-th says."""
+    left = iter(behaviours)
+    return lambda call: next(left)(call)
 
 
 def only(word: str, behaviour: Behaviour, others: Behaviour = succeed) -> Behaviour:
@@ -235,8 +235,7 @@ class FakeJob:
         for step in self.work.steps:
             module, *words = step.words
             if module != TRAINING or not is_finished(step.folder):
-                attempt = self._executor.started().count(tuple(words))
-                call = Call(module, tuple(words), step.folder, self.work.log, attempt)
+                call = Call(module, tuple(words), step.folder, self.work.log)
                 self._executor.calls.append(call)
                 code = yield from self._executor.behaviour(call)
             if code:

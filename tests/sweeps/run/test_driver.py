@@ -22,7 +22,6 @@ from sweeps.run.driver import drive, work_of
 from sweeps.run.running_point import RunningPoint
 from sweeps.settings import Launcher, Objective
 from tests.sweeps.fakes import (
-    Behaviour,
     Call,
     FakeView,
     ListDesk,
@@ -35,6 +34,7 @@ from tests.sweeps.fakes import (
     lasting,
     leave,
     measure,
+    nth,
     only,
     plan_of,
     points,
@@ -235,12 +235,6 @@ def test_run_of_another_process_is_left_in_place(tmp_path: Path) -> None:
         again.runs.fresh = True
         assert len(again.run().executor.calls) == calls
     assert [path.name for path in (tmp_path / "replaced").iterdir()] == [f"{folder.name}-1"]
-
-
-def nth(*behaviours: Behaviour) -> Behaviour:
-    """The n-th trial behaves as the n-th says."""
-    left = iter(behaviours)
-    return lambda call: next(left)(call)
 
 
 def test_a_hopeless_trial_is_pruned(tmp_path: Path) -> None:
