@@ -29,6 +29,10 @@ def failing(config: DictConfig, overrides: list[str]) -> int | None:
         raise RunError("two failed.")
     if config.seed == 3:
         raise ZeroDivisionError("three")
+    if config.seed == 6:
+        from submitit.core.utils import FailedJobError
+
+        raise FailedJobError("job 7 has no output.")
     return 4 if config.seed == 4 else None
 
 
@@ -120,3 +124,8 @@ def test_basic_launcher_of_one_run_and_one_that_is_only_shown_are_accepted(call:
     assert call(entry, "hydra/launcher=basic")[:2] == (0, "seed 0: []\n")
     code, out, _ = call(entry, "hydra/launcher=submitit_slurm", "--cfg", "hydra", "-p", "hydra")
     assert (code, "SlurmLauncher" in out) == (0, True)
+
+
+def test_job_that_is_lost_is_one_message(call: Call) -> None:
+    pytest.importorskip("submitit")
+    assert call(entry, "seed=6")[::2] == (1, "rgbt: job 7 has no output.\n")
