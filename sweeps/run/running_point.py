@@ -94,7 +94,7 @@ class RunningPoint:
     score: float = field(default=math.nan, init=False)
 
     def __post_init__(self) -> None:
-        self._began = time.monotonic()
+        self._began, self._has_begun = time.monotonic(), False
         self._first = (math.inf, sys.maxsize)  # time and step at the first look at the metrics
         self._size, self._validated = 0, 0  # of the metrics, and step of the last one reported
         self._end: End | None = None  # of a point that is cancelled
@@ -121,8 +121,10 @@ class RunningPoint:
         be reported is reported by the next call.
         """
         state = executor.state(self.job)
-        if not self.is_started and self.log.exists() and self.log.stat().st_size > self.begin:
-            self.is_started, self._began = True, time.monotonic()
+        has_log = self.log.exists() and self.log.stat().st_size > self.begin
+        self.is_started = state == "running" and has_log  # not while it is queued again
+        if self.is_started and not self._has_begun:
+            self._has_begun, self._began = True, time.monotonic()
         reason = self.read(runs.runs_dir)
         if state not in ("queued", "running"):
             found = self._end or self._how_ended(state, runs)
