@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,8 +13,10 @@ from typing import Any, NoReturn
 import numpy as np
 import optuna
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.compose import conf_dir
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
@@ -32,33 +33,21 @@ from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import RunningPoint
 from sweeps.run.search_source import SearchSource
-from sweeps.settings import Objective, SweepSettings
+from sweeps.settings import Launcher, Objective, SweepSettings, read_settings
 from sweeps.space import build_sampler, parse_space
 from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"
-DEADLINE_S = 180.0
-"""Generous: the machine may be busy. Nothing waits for it but a test that fails."""
 
 
 def settings(**changes: Any) -> SweepSettings:
-    """Settings of a sweep, as in study.yaml but for `changes`."""
-    none = ("storage", "workers", "gpus", "timeout_minutes", "commands", "study", "pruner")
-    plain: dict[str, Any] = {
-        **dict.fromkeys((*none, "trials", "hours")),
-        "retry": "none",
-        "wait": True,
-        "stop_jobs": False,
-        "dry_run": False,
-        "params": {},
-        "points": (),
-        "space": {},
-        "objectives": (Objective("test/mIoU", "maximize"),),
-        "sampler": {"_target_": "optuna.samplers.RandomSampler", "seed": 0},
-        "replicates": 1,
-        "trust": "",
-    }
-    return SweepSettings(**{**plain, **changes})
+    """Settings of a sweep, as in study.yaml but for `changes` and the first two."""
+    file = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
+    assert isinstance(file, DictConfig)
+    objectives = (Objective("test/mIoU", "maximize"),)
+    sampler = {"_target_": "optuna.samplers.RandomSampler", "seed": 0}
+    plain = read_settings(file, Launcher())
+    return replace(plain, **{"objectives": objectives, "sampler": sampler, **changes})
 
 
 def key_of(overrides: Sequence[str]) -> str:
@@ -129,18 +118,12 @@ def finish(
     run = RunFolder(folder)
     run.describe(Description(f"fake {folder.name}", {"rgbt.key": folder.name, **(tags or {})}, {}))
     counts(dataset=dataset).save(run.path / counts_name("test"))
-    run.finish(
-        {
-            "name": f"fake {folder.name}",
-            "key": folder.name,
-            "dataset": dataset,
-            "steps": 4,
-            "best_step": 4,
-            "seconds_of_last_process": 2.5,
-            "val": {"mIoU": 0.5} if val is None else dict(val),
-            "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
-        }
-    )
+    scores = {
+        "val": {"mIoU": 0.5} if val is None else dict(val),
+        "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
+    }
+    known = {"name": f"fake {folder.name}", "key": folder.name, "dataset": dataset}
+    run.finish({**known, "steps": 4, "best_step": 4, "seconds_of_last_process": 2.5, **scores})
     return run
 
 
@@ -243,14 +226,11 @@ class FakeJob:
         self._say(how_ended(code))
 
     def look(self) -> str:
-        if self.is_stopped and not self.end:
+        if self.is_stopped and self.end != "ended":
             self._say(how_ended(143))
             self.end = "ended"
-        if not self.end:
-            try:
-                next(self._process)
-            except StopIteration:
-                self.end = "ended"
+        elif next(self._process, "ended"):
+            self.end = "ended"
         return self.end or "running"
 
 
@@ -269,11 +249,9 @@ class FakeExecutor:
         return [self._job(work) for work in works]
 
     def _job(self, work: Work) -> str:
-        for job, known in self.jobs.items():
-            if self.is_lasting and known.work.key == work.key and not known.end:
-                return job
-        job = str(len(self.jobs))
-        self.jobs[job] = FakeJob(work, self)
+        known = [job for job, one in self.jobs.items() if one.work.key == work.key and not one.end]
+        job = known[0] if known and self.is_lasting else str(len(self.jobs))
+        self.jobs.setdefault(job, FakeJob(work, self))
         return job
 
     def state(self, job: str) -> str:
@@ -344,8 +322,27 @@ def driven_by(executor: FakeExecutor, view: FakeView) -> Any:
         yield
 
 
-class ListDesk:
-    """A list of points, or so many (x=0, x=1, ...), with all that it needs."""
+class Desk:
+    """A driver with all that it needs; `slots` are those of an executor that is not given."""
+
+    def __init__(
+        self,
+        runs_dir: Path,
+        behaviour: Behaviour = succeed,
+        *,
+        executor: FakeExecutor | None = None,
+        view: FakeView | None = None,
+        slots: int = 1,
+        planner: Any = None,
+        **changes: Any,
+    ) -> None:
+        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
+        self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
+        self.planner = planner or FakePlanner()
+
+
+class ListDesk(Desk):
+    """A driver of a list of points, or of so many (x=0, x=1, ...)."""
 
     def __init__(
         self,
@@ -353,20 +350,14 @@ class ListDesk:
         given: Sequence[Point] | int,
         behaviour: Behaviour = succeed,
         *,
-        executor: FakeExecutor | None = None,
-        view: FakeView | None = None,
-        slots: int = 1,
         study: str = "study",
-        planner: Any = None,
         more: Any = None,
         rank: Any = None,
-        **changes: Any,
+        **others: Any,
     ) -> None:
-        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
-        self.executor = executor or FakeExecutor(behaviour, slots)
-        self.view = view or FakeView()
+        super().__init__(runs_dir, behaviour, **others)
         self.given = tuple(points(given) if isinstance(given, int) else given)
-        self.planner = planner or FakePlanner()
+        self.keys = [plan_of(point).key for point in self.given]
         what = (self.given, self.runs, self.planner, more, rank)
         self.points = PointList(study, study, *what)
         self.outcomes: list[Outcome] | None = None
@@ -376,36 +367,30 @@ class ListDesk:
             self.outcomes = point_list.run_points(self.points, self.settings, strict=strict)
         return self
 
-    def states(self) -> dict[str, str]:
-        return {each.point.label: each.state for each in self.outcomes or ()}
+    def states(self) -> list[str]:
+        return [each.state for each in self.outcomes or ()]
 
 
-class SearchDesk:
-    """A search over x in 0..1, or over `space`, with all that it needs."""
+class SearchDesk(Desk):
+    """A driver of a search over x in 0..1, or over `space`."""
 
     def __init__(
         self,
         runs_dir: Path,
         behaviour: Behaviour = succeed,
         *,
-        executor: FakeExecutor | None = None,
-        view: FakeView | None = None,
-        slots: int = 1,
         space: Mapping[str, Any] | None = None,
         storage: Any = None,
-        planner: Any = None,
         pruner: Any = None,
-        **changes: Any,
+        **others: Any,
     ) -> None:
-        self.runs = RunStore(runs_dir, NoTracking())
-        self.settings = settings(pruner=pruner and {"_target_": "given"}, **changes)
-        self.executor = executor or FakeExecutor(behaviour, slots)
-        self.view, self.storage = view or FakeView(), storage or optuna.storages.InMemoryStorage()
+        super().__init__(runs_dir, behaviour, pruner=pruner and {"_target_": "given"}, **others)
+        self.storage = storage or optuna.storages.InMemoryStorage()
         both = {"sampler": build_sampler(self.settings.sampler), "pruner": pruner}
         self.study = open_study("study", self.storage, self.settings.objectives, {}, **both)
         searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
         given = ((), searched, self.study, self.settings, self.view.say)
-        self.source = SearchSource(*given, planner or FakePlanner())
+        self.source = SearchSource(*given, self.planner)
 
     def run(self) -> SearchDesk:
         with driven_by(self.executor, self.view):
@@ -418,22 +403,3 @@ class SearchDesk:
 
     def states(self) -> list[str]:
         return [trial.state.name for trial in self.trials]
-
-
-def until(condition: Callable[[], Any], what: str) -> Any:
-    """What `condition` answers once it is true; fails after `DEADLINE_S`."""
-    end = time.monotonic() + DEADLINE_S
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.01)
-    raise AssertionError(f"waited {DEADLINE_S:g} s in vain for {what}")
-
-
-def is_alive(pid: int) -> bool:
-    """Whether a process of this machine runs; a zombie does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,9 +17,8 @@ from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.run import driver as drivers
 from sweeps.run import running_point
-from sweeps.run.driver import drive, work_of
-from sweeps.run.running_point import RunningPoint
-from sweeps.settings import Launcher, Objective
+from sweeps.run.driver import work_of
+from sweeps.settings import Objective
 from tests.sweeps.fakes import (
     Call,
     FakeView,
@@ -37,9 +35,7 @@ from tests.sweeps.fakes import (
     nth,
     only,
     plan_of,
-    points,
     scored,
-    settings,
 )
 
 UP = (Objective("val/mIoU", "maximize"),)
@@ -53,7 +49,7 @@ def test_points_are_run_in_order_and_a_second_call_runs_nothing(tmp_path: Path) 
     desk = ListDesk(tmp_path, 4, slots=2, view=view).run()
     assert max(most) == 2
     assert desk.executor.started() == [(f"x={x}",) for x in range(4)]
-    assert set(desk.states().values()) == {"finished"}
+    assert set(desk.states()) == {"finished"}
     assert [how for _, how, _ in view.ends] == ["finished"] * 4
     first = {"finished": 0, "running": 2, "failed": 0, "waiting": 2}
     assert (view.counts[0], view.counts[-1]["finished"]) == (first, 4)
@@ -63,17 +59,16 @@ def test_points_are_run_in_order_and_a_second_call_runs_nothing(tmp_path: Path) 
 
 def test_all_free_points_are_one_submission(tmp_path: Path) -> None:
     desk = ListDesk(tmp_path, 5, slots=9)
-    keys = [plan_of(point).key for point in desk.given]
-    finish(tmp_path / keys[0])
-    assert desk.run().executor.submits == [keys[1:]]
+    finish(tmp_path / desk.keys[0])
+    assert desk.run().executor.submits == [desk.keys[1:]]
 
 
 def test_a_failed_point_does_not_stop_the_others(tmp_path: Path) -> None:
     behaviour = only("x=0", fail, only("x=1", leave(-9)))
     desk = ListDesk(tmp_path, 4, behaviour)
-    other = tmp_path / plan_of(desk.given[3]).key
+    other = tmp_path / desk.keys[3]
     finish(other, dataset="another")
-    assert list(desk.run().states().values()) == ["failed", "failed", "finished", "failed"]
+    assert desk.run().states() == ["failed", "failed", "finished", "failed"]
     reasons = [each.reason for each in desk.outcomes or ()]
     assert reasons[0] == "ValueError: a bad day"
     assert "SIGKILL" in reasons[1]
@@ -129,7 +124,7 @@ def test_a_run_is_evaluated_by_its_job(tmp_path: Path, is_broken: bool) -> None:
     desk = ListDesk(tmp_path, given, behaviour).run()
     modules = [call.module for call in desk.executor.calls]
     assert modules == ["rgbt.run", *["rgbt.evaluate"] * (1 if is_broken else 2)]
-    assert desk.states() == {"p": "failed" if is_broken else "finished"}
+    assert desk.states() == ["failed" if is_broken else "finished"]
     assert len(desk.executor.submits) == 1
 
 
@@ -157,7 +152,7 @@ def test_a_point_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(running_point, "time", SimpleNamespace(monotonic=now))
     desk = ListDesk(tmp_path, 2, only("x=0", hang), timeout_minutes=1).run()
-    assert desk.states() == {"x=0": "failed", "x=1": "finished"}
+    assert desk.states() == ["failed", "finished"]
     assert "timeout_minutes" in desk.view.ends[0][2]
     assert desk.executor.stopped() == ["0"]
     # Jobs that wait for their turn have no limit.
@@ -184,7 +179,7 @@ def test_ctrl_c_stops_jobs_that_would_end_with_the_command(
     assert executor.stopped() == stopped
     assert [job for job, found in executor.jobs.items() if found.end] == stopped
     again = ListDesk(tmp_path, 3, executor=executor).run()
-    assert set(again.states().values()) == {"finished"}
+    assert set(again.states()) == {"finished"}
     assert len(executor.jobs) == 3 + len(stopped)
 
 
@@ -192,19 +187,18 @@ def test_without_wait_a_call_submits_and_the_next_records(tmp_path: Path) -> Non
     cluster = lasting(slots=3)
     cluster.is_full = True
     desk = ListDesk(tmp_path, 4, executor=cluster, wait=False).run()
-    keys = [plan_of(point).key for point in desk.given]
-    assert cluster.submits == [keys[:3]]
-    assert list(desk.states().values()) == ["running"] * 3 + ["waiting"]
+    assert cluster.submits == [desk.keys[:3]]
+    assert desk.states() == ["running"] * 3 + ["waiting"]
     assert [how for how, _ in desk.view.said] == ["queued"] * 3
     assert "job 2" in desk.view.said[2][1]
     cluster.is_full = False
     while cluster.jobs["0"].look() == "running":
         pass
     again = ListDesk(tmp_path, 4, executor=cluster, wait=False).run()
-    assert again.states()["x=0"] == "finished"
+    assert again.states()[0] == "finished"
     assert len(cluster.jobs) == 4, "points that have a job keep it"
     last = ListDesk(tmp_path, 4, executor=cluster).run()
-    assert set(last.states().values()) == {"finished"}
+    assert set(last.states()) == {"finished"}
     assert len(cluster.calls) == 4
 
 
@@ -215,17 +209,11 @@ def test_runs_of_this_machine_are_waited_for(tmp_path: Path) -> None:
     assert desk.executor.submits == []
 
 
-def test_no_launcher_is_opened_but_that_of_the_settings(tmp_path: Path) -> None:
-    desk = SearchDesk(tmp_path, trials=1)
-    with pytest.raises(InputError, match="hydra/launcher=joblib"):
-        drive(desk.view, desk.source, desk.runs, settings(launcher=Launcher("joblib")))  # type: ignore[arg-type]
-
-
 def test_run_of_another_process_is_left_in_place(tmp_path: Path) -> None:
     """With fresh=true, a finished run of other code is moved away, but not while it is held."""
     desk = ListDesk(tmp_path, 1)
     desk.runs.fresh = True
-    folder = tmp_path / plan_of(desk.given[0]).key
+    folder = tmp_path / desk.keys[0]
     finish(folder).add_provenance({"code": "0" * 64, "diff": ""})
     with holding(folder / "lock"):
         work_of(plan_of(desk.given[0]), desk.runs, "")
@@ -279,17 +267,3 @@ def test_a_storage_that_is_away_ends_the_command(
     monkeypatch.setattr(desk.study, "tell", tell)
     again = SearchDesk(tmp_path, storage=desk.storage, objectives=UP, trials=1).run()
     assert (again.states(), again.executor.calls) == (["COMPLETE"], [])
-
-
-def test_points_without_hours_left_stay_free(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hours = [0.0]
-    clock = SimpleNamespace(monotonic=lambda: 3600 * hours[0], sleep=lambda _: None)
-    monkeypatch.setattr(drivers, "time", clock)
-
-    def look(_: Sequence[RunningPoint]) -> None:
-        hours[0] += 0.3
-
-    desk = ListDesk(tmp_path, points(3), view=FakeView(look), hours=1.0).run()
-    assert list(desk.states().values()) == ["finished", "finished", "waiting"]
