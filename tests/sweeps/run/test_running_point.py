@@ -26,6 +26,7 @@ from tests.sweeps.fakes import (
     finish,
     hang,
     leave,
+    nth,
     plan_of,
     scored,
     succeed,
@@ -133,7 +134,8 @@ def told(steps: list[int], reason: str = "") -> Callable[[MetricLine], str]:
 
 def test_validations_of_the_first_seed_are_reported(tmp_path: Path) -> None:
     plan, steps = plan_of(Point("p", ("x=1",), seeds=(0, 1))), list[int]()
-    end = Bench(tmp_path, report=told(steps), plan=plan).run()
+    seeds = nth(scored(0.2, 0.4), scored(0.2, 0.4, 0.5))
+    end = Bench(tmp_path, seeds, told(steps), plan).run()
     assert [each.key for each in end.results] == [run.key for run in plan.runs]
     assert steps == [2, 4]
 
