@@ -8,17 +8,12 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from rgbt.checks import InputError
+from rgbt.config.command import LAUNCHERS
 from sweeps.run.job import Work
 from sweeps.run.local import LocalExecutor
 from sweeps.settings import GpuSlot, Launcher
 
-# Launchers that work, and the package and the extra that they need.
-LAUNCHERS = {
-    "basic": None,
-    "submitit_local": ("submitit", "slurm"),
-    "submitit_slurm": ("submitit", "slurm"),
-    "ray": ("ray", "ray"),
-}
+WORKING = ("basic", "submitit_local", "submitit_slurm", "ray")
 
 
 class Executor(Protocol):
@@ -40,13 +35,11 @@ class Executor(Protocol):
 def check_launcher(launcher: Launcher) -> None:
     """InputError: a launcher with which a sweep does not work, or its packages are missing."""
     name = launcher.name
-    if name not in LAUNCHERS:
-        hint = " Its n_jobs is hydra.sweeper.workers." if name == "joblib" else ""
-        known = ", ".join(LAUNCHERS)
-        raise InputError(f"hydra/launcher={name}: a sweep works with {known}.{hint}")
-    needed = LAUNCHERS[name]
-    if needed is not None and find_spec(needed[0]) is None:
-        raise InputError(f"hydra/launcher={name} needs: pip install 'rgbt[{needed[1]}]'.")
+    if name not in WORKING:
+        hint = f" ({LAUNCHERS[name]})" if name in LAUNCHERS else ""
+        raise InputError(f"hydra/launcher={name}: a sweep works with {', '.join(WORKING)}{hint}.")
+    if name == "ray" and find_spec("ray") is None:
+        raise InputError("hydra/launcher=ray: it needs pip install 'rgbt[ray]'.")
 
 
 def open_executor(

@@ -37,7 +37,7 @@ class PointList:
         planner: plans them, with the overrides that all have.
         more: further points, from the outcomes until now; requested when no point is waiting.
         rank: which waiting point is the next: the one of the highest rank, and `more` is requested
-            before each; None: they are run in their order.
+            after each end; None: they are run in their order.
     """
 
     study: str
@@ -74,6 +74,7 @@ class ListSource:
         self._running: set[str] = set()  # keys
         self._finished: dict[str, tuple[RunResult, ...]] = {}
         self._failed: dict[str, str] = {}  # key -> reason, or "": not in this command or before
+        self._is_changed = True  # a point has ended since `more` was requested
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -114,7 +115,8 @@ class ListSource:
     def next(self) -> Task | None:
         """See `Source.next`."""
         more, rank = self._list.more, self._list.rank
-        if more and rank:
+        if more and rank and self._is_changed:
+            self._is_changed = False
             self._add(more(self.outcomes()))
         task = self._next_waiting()
         # Points that were added before this command was stopped are finished: others follow them.
@@ -131,7 +133,7 @@ class ListSource:
 
     def record(self, task: Task, end: End) -> End:
         """See `Source.record`."""
-        key = task.plan.key
+        key, self._is_changed = task.plan.key, True
         self._running.discard(key)
         self._failed[key] = end.reason
         if end.state == "finished":
