@@ -11,9 +11,9 @@ from rgbt.config.options import types_of
 from rgbt.runs.result import OWN
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import Options, entry, settings_of
-from sweeps.settings import SweepSettings
 from sweeps.run import point_list
 from sweeps.run.point_list import PointList
+from sweeps.settings import SweepSettings
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
 

@@ -26,7 +26,12 @@ def test_sweeper_file_holds_all_settings() -> None:
     assert keys == {field.name for field in fields(SweepSettings)} - {"launcher"}
     settings = changed()
     assert settings.objectives == (Objective("val/mIoU", "maximize"),)
-    assert (settings.workers, settings.points, settings.pruner, settings.trust) == (None, (), None, "")
+    assert (settings.workers, settings.points, settings.pruner, settings.trust) == (
+        None,
+        (),
+        None,
+        "",
+    )
     assert (settings.wait, settings.stop_jobs, settings.commands) == (True, False, None)
     assert settings.launcher == Launcher("ray", {"num_gpus": 0.25})
 

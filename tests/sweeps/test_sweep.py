@@ -21,13 +21,13 @@ from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.settings import Launcher, Objective, SweepSettings
-from sweeps.space import parse_space
-from sweeps.sweep import Search, probe, search, sweep
 from sweeps.run import executors, point_list
 from sweeps.run.optuna_study import driving, known_studies
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import open_run_store
+from sweeps.settings import Launcher, Objective, SweepSettings
+from sweeps.space import parse_space
+from sweeps.sweep import Search, probe, search, sweep
 from tests.commands import SPLITS, short, words_of
 from tests.conftest import write_data
 from tests.sweeps.fakes import settings as plain_settings
@@ -164,7 +164,7 @@ def test_a_launcher_without_its_package_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executors, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match="hydra/launcher=ray needs: pip install"):
+    with pytest.raises(InputError, match="hydra/launcher=ray: it needs pip install"):
         call(tmp_path, *GRID, "hydra/launcher=ray")
 
 

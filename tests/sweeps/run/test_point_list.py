@@ -221,7 +221,7 @@ def test_commands_are_a_line_of_shell_for_every_point_that_is_left(
     for name in ("__init__", "run", "evaluate"):
         Path(f"rgbt/{name}.py").write_text(FAKE_RUN if name != "__init__" else "")
     tags, rgb = {"t": "a 'b' $HOME"}, ("modality=rgb",)
-    words = ("x=[1, 2]", "name=it's; a $(b) \"c\"")
+    words = ("x=[1, 2]", 'name=it\'s; a $(b) "c"')
     given = [Point("p", words, {}, tags, (), (rgb,)), *named("x=1", "x=2", "x=3", "x=1")]
     desk = ListDesk(tmp_path / "runs", given, commands=str(tmp_path / "all.txt"))
     finish(desk.runs.runs_dir / desk.keys[2])

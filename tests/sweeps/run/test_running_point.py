@@ -60,9 +60,7 @@ class Bench:
         return end
 
 
-def test_a_point_is_followed_to_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_point_is_followed_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seconds = [100.0]
     monkeypatch.setattr(running_point, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
     bench = Bench(tmp_path, scored(0.1, 0.2, 0.4))

@@ -180,10 +180,13 @@ def test_a_search_of_one_worker_is_known_by_its_seed(tmp_path: Path) -> None:
     sampler = {"_target_": "optuna.samplers.TPESampler", "seed": 0}
     wanted = {"sampler": sampler, "objectives": UP, "trials": 20}
     desk = SearchDesk(tmp_path, behave, space=SPACE, **wanted).run()
-    assert RECORDED.items() <= {
-        trial.number: (round(trial.params["x"], 4), trial.params["y"], trial.params["z"])
-        for trial in desk.trials
-    }.items()
+    assert (
+        RECORDED.items()
+        <= {
+            trial.number: (round(trial.params["x"], 4), trial.params["y"], trial.params["z"])
+            for trial in desk.trials
+        }.items()
+    )
 
 
 RECORDED = {0: (2.3731, 6, "b"), 12: (1.7039, 5, "b"), 19: (0.6025, 6, "b")}
