@@ -142,7 +142,7 @@ def test_commands_are_in_the_order_of_the_queue(place: Path) -> None:
     assert run(place, commands=place / "file") == (0, [])
     lines = (place / "file").read_text().splitlines()
     names = [line.partition("+experiment=")[2].split()[0] for line in lines]
-    assert names == ["cmx", "rtfnet", "mfnet", "crm", "baseline"]
+    assert names == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
 
 
 def test_dry_run_prints_the_order_with_minutes(
