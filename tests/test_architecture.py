@@ -77,6 +77,7 @@ OUTSIDE = {
         "analysis",
         "rgbt.evaluation.profile",
         "rgbt.evaluation.profiled_network",
+        "rgbt.runtime.group",
     }
     | {f"rgbt.{each}" for each in READING - {"data", "geometry"}},
     "analysis": {f"rgbt.{each}" for each in READING - {"geometry"}},
