@@ -75,6 +75,8 @@ class Driver:
         except BaseException:
             if self.settings.stop_jobs or not self.executor.is_lasting:
                 self._stop()
+            elif self.running:
+                self.view.say("note", f"{len(self.running)} jobs continue without this command.")
             raise
 
     def _step(self) -> bool:

@@ -20,7 +20,7 @@ class Executor(Protocol):
     """Executes points. A job is its name, which another driver of the study understands too."""
 
     slots: int  # jobs at the same time, queued ones included
-    is_lasting: bool  # whether jobs go on without the driver
+    is_lasting: bool  # whether jobs continue without the driver
 
     def submit(self, works: Sequence[Work]) -> list[str]:
         """Start or queue jobs; a point that has one already keeps it. RunError: not possible."""

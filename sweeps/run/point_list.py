@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -71,6 +71,7 @@ class ListSource:
         self.errors: dict[int, str] = {}
         # Indices of equal points, by key; the first one is run.
         self._same: dict[str, list[int]] = {}
+        self._order: list[PlannedPoint] = []  # the different ones, in the order of execution
         self._running: set[str] = set()  # keys
         self._finished: dict[str, tuple[RunResult, ...]] = {}
         self._failed: dict[str, str] = {}  # key -> reason, or "": not in this command or before
@@ -99,6 +100,7 @@ class ListSource:
             for index in indices:
                 plan = self._plans[index]
                 self._plans[index] = replace(plan, point=replace(plan.point, tags=merged))
+        self._order = [self._plans[indices[0]] for indices in self._same.values()]
         return len(self._same) > before
 
     def _plan(self, index: int, point: Point) -> None:
@@ -118,6 +120,7 @@ class ListSource:
         if more and rank and self._is_changed:
             self._is_changed = False
             self._add(more(self.outcomes()))
+            self._order.sort(key=lambda plan: rank(plan.point), reverse=True)
         task = self._next_waiting()
         # Points that were added before this command was stopped are finished: others follow them.
         while task is None and more and self._add(more(self.outcomes())):
@@ -125,7 +128,7 @@ class ListSource:
         return task
 
     def _next_waiting(self) -> Task | None:
-        for plan in self._different():
+        for plan in self._order:
             if self._outcome(plan).state == "waiting":
                 self._running.add(plan.key)
                 return Task(plan)
@@ -166,12 +169,6 @@ class ListSource:
                 outcome = replace(outcome, state=state, results=results)
             found.append(outcome)
         return found
-
-    def _different(self) -> Iterator[PlannedPoint]:
-        plans = (self._plans[indices[0]] for indices in self._same.values())
-        if (rank := self._list.rank) is None:
-            return plans
-        return iter(sorted(plans, key=lambda plan: rank(plan.point), reverse=True))
 
     def _outcome(self, plan: PlannedPoint) -> Outcome:
         """The state of a point by its run folders, and by the log of a job that failed."""
