@@ -107,25 +107,11 @@ VIEWS = ("virtual", "next")
 """Both protocols of virtual views are one command."""
 
 
-def evaluating(call: Call) -> Process:
-    yield
-    for words in (RGB, RING) if call.module == "rgbt.evaluate" else ():
-        if set(words) <= set(call.words):
-            measure(call.folder, words)
-    if call.module == "rgbt.run":
-        finish(call.folder)
-    return 0
-
-
-@pytest.mark.parametrize("is_broken", [False, True])
-def test_a_run_is_evaluated_by_its_job(tmp_path: Path, is_broken: bool) -> None:
+def test_evaluations_are_steps_of_the_job(tmp_path: Path) -> None:
     given = [Point("p", ("x=1",), evaluations=(RGB, RING))]
-    behaviour = only("modality=rgb", fail, evaluating) if is_broken else evaluating
-    desk = ListDesk(tmp_path, given, behaviour).run()
-    modules = [call.module for call in desk.executor.calls]
-    assert modules == ["rgbt.run", *["rgbt.evaluate"] * (1 if is_broken else 2)]
-    assert desk.states() == ["failed" if is_broken else "finished"]
-    assert len(desk.executor.submits) == 1
+    desk = ListDesk(tmp_path, given, only("modality=rgb", fail)).run()
+    assert [call.module for call in desk.executor.calls] == ["rgbt.run", "rgbt.evaluate"]
+    assert (desk.states(), len(desk.executor.submits)) == (["failed"], 1)
 
 
 @pytest.mark.parametrize(("cores", "fitting"), [(6, None), (5, 2), (3, 1)])

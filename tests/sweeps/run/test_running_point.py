@@ -126,8 +126,8 @@ def test_a_score_that_is_no_number_fails(tmp_path: Path, score: float | None) ->
     assert ("no test/mIoU that is a number" in checked.reason) == (score != 0.5)
 
 
-def told(steps: list[int], reason: str = "") -> Callable[[MetricLine], str]:
-    return lambda line: steps.append(line.step) or reason
+def told(steps: list[int]) -> Callable[[MetricLine], str]:
+    return lambda line: steps.append(line.step) or ""
 
 
 def test_validations_of_the_first_seed_are_reported(tmp_path: Path) -> None:
@@ -136,13 +136,6 @@ def test_validations_of_the_first_seed_are_reported(tmp_path: Path) -> None:
     end = Bench(tmp_path, seeds, told(steps), plan).run()
     assert [each.key for each in end.results] == [run.key for run in plan.runs]
     assert steps == [2, 4]
-
-
-def test_a_pruned_point_is_cancelled(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, scored(0.2, end=hang), told([], "pruned at step 2"))
-    end = bench.run()
-    assert (end.state, end.reason) == ("pruned", "pruned at step 2")
-    assert bench.executor.stopped() == ["0"]
 
 
 def test_a_report_that_was_not_stored_is_repeated(tmp_path: Path) -> None:
