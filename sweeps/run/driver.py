@@ -110,8 +110,8 @@ class Driver:
                 break
             work, end = self._look(task)
             if work is None:
+                end = self.source.record(task, end)
                 self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
-                self.source.record(task, end)
             else:
                 works.append(work)
                 tasks.append(task)

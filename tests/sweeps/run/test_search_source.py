@@ -23,6 +23,7 @@ from tests.sweeps.fakes import (
     Process,
     SearchDesk,
     fail,
+    finish,
     interrupt_when,
     lasting,
     nth,
@@ -159,6 +160,14 @@ def test_a_trial_whose_driver_was_killed_while_it_asked_gets_its_parameters(
         assert [word[:2] for word in found] == ["x=", "y="]
         assert found[0] == wanted[0]
         assert len(again.trials) == 1
+
+
+def test_a_run_that_ended_without_a_driver_is_said_as_it_counts(tmp_path: Path) -> None:
+    desk = SearchDesk(tmp_path, trials=1)
+    finish(tmp_path / taken(desk).plan.key, test={"mIoU": None})
+    again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
+    assert (again.states(), again.executor.submits) == (["FAIL"], [])
+    assert [how for how, _ in again.view.said] == ["failed"]
 
 
 SPACE = {
