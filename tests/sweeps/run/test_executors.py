@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from hydra.errors import MissingConfigException
 
 from rgbt.checks import InputError
+from rgbt.config.command import hydra_sentence
 from sweeps.run import executors
 from sweeps.run.executors import check_launcher, open_executor
 from sweeps.run.local import LocalExecutor
@@ -26,6 +28,13 @@ def test_other_and_missing_launchers_are_refused(
     check_launcher(Launcher())
     with pytest.raises(InputError, match=said):
         check_launcher(Launcher(name))
+
+
+def test_a_launcher_that_is_not_installed_names_the_extra() -> None:
+    for name in ("submitit_slurm", "submitit_local"):
+        error = MissingConfigException("", f"hydra/launcher/{name}", ["basic", "ray"])
+        said = f"hydra/launcher={name}: it needs pip install 'rgbt[slurm]'."
+        assert hydra_sentence(error, []) == said
 
 
 def test_gpus_are_chosen_for_jobs_of_this_machine_alone() -> None:
