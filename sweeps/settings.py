@@ -64,7 +64,7 @@ NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 class Launcher(NamedTuple):
     """The choice of ``hydra/launcher``, and its settings (``hydra.launcher``)."""
 
-    name: str = "basic"
+    name: Text = "basic"
     options: dict[str, Any] = {}
 
 
