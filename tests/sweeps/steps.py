@@ -29,39 +29,50 @@ def facts() -> str:
     return json.dumps(known)
 
 
-def do(what: str, place: Path, *words: str) -> None:
-    print("said", what, flush=True)
-    if what == "tell":
-        note(place, facts())
-    elif what == "leave":
-        print(*words[1:], end="", file=sys.stderr, flush=True)  # half a line
-        sys.exit(int(words[0]))
-    elif what == "raise":
-        raise ValueError("a bad day")
-    elif what == "kill":
-        os.kill(os.getpid(), int(words[0]))
-    elif what == "wait":  # until there is a file of that name; words are signals to ignore
-        for number in words:
-            signal.signal(int(number), signal.SIG_IGN)
-        sleeper = subprocess.Popen(["sleep", "600"])
-        note(place, f"{facts()}\n{os.getpid()} {sleeper.pid}")
+def tell(place: Path) -> None:
+    note(place, facts())
+
+
+def leave(place: Path, code: str, *words: str) -> None:
+    print(*words, end="", file=sys.stderr, flush=True)  # half a line
+    sys.exit(int(code))
+
+
+def fail(place: Path) -> None:
+    raise ValueError("a bad day")
+
+
+def kill(place: Path, number: str) -> None:
+    os.kill(os.getpid(), int(number))
+
+
+def wait(place: Path, *ignored: str) -> None:
+    """Until a file says that it may go on; with a child, and without these signals."""
+    for number in ignored:
+        signal.signal(int(number), signal.SIG_IGN)
+    sleeper = subprocess.Popen(["sleep", "600"])
+    note(place, f"{facts()}\n{os.getpid()} {sleeper.pid}")
+    while not place.with_suffix(".go").exists():
+        time.sleep(0.01)
+    sleeper.kill()
+    place.with_suffix(".done").touch()
+
+
+def train(place: Path) -> None:
+    """As a training: it holds the lock of its folder, and SIGTERM stops it."""
+    from rgbt.files.atomic import holding
+
+    with holding(place.parent / "lock") as holder:
+        if holder is not None:
+            sys.exit(f"rgbt: {holder} holds it.")
+        with (place.parent / "steps").open("a") as file:
+            file.write("begin\n")
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         while not place.with_suffix(".go").exists():
             time.sleep(0.01)
-        sleeper.kill()
-        place.with_suffix(".done").touch()
-    elif what == "train":  # holds the lock of its folder, is stopped by SIGTERM, and then resumes
-        from rgbt.files.atomic import holding
-
-        with holding(place.parent / "lock") as holder:
-            if holder is not None:
-                sys.exit(f"rgbt: {holder} holds it.")
-            with (place.parent / "steps").open("a") as file:
-                file.write("begin\n")
-            signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-            while not place.with_suffix(".go").exists():
-                time.sleep(0.01)
-            note(place.parent / "result.json", "{}")
+        note(place.parent / "result.json", "{}")
 
 
 if __name__ == "__main__":
-    do(sys.argv[1], Path(sys.argv[2]), *sys.argv[3:])
+    print("said", sys.argv[1], flush=True)
+    globals()[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])

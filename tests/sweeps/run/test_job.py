@@ -60,7 +60,7 @@ def test_command_gets_words_folder_and_variables(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "reason", "is_failure"),
     [
-        ("raise x", 1, "ValueError: a bad day", True),
+        ("fail x", 1, "ValueError: a bad day", True),
         ("leave x 3 half", 3, "half", True),
         ("leave x 143 rgbt: stopped", 143, "stopped", False),
         ("kill x 9", -9, "stopped by SIGKILL (out of memory?)", False),
