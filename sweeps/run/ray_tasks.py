@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import ray
@@ -40,12 +41,14 @@ class Keeper:
 
     def __init__(self) -> None:
         self._tasks: dict[str, Any] = {}
+        self._sizes: dict[str, int] = {}  # of logs before; they grow when a task begins
         self._ends: dict[str, str] = {}
 
     def submit(self, job: str, work: Work, resources: Mapping[str, Any]) -> None:
         """Queue a job, unless it is queued or runs."""
         if self.state(job) not in ("queued", "running"):
             self._ends.pop(job, None)
+            self._sizes[job] = _size(job)
             self._tasks[job] = ray.remote(_execute).options(**resources).remote(work)
 
     def state(self, job: str) -> str:
@@ -53,7 +56,7 @@ class Keeper:
         if job not in self._tasks:
             return self._ends.get(job, "ended")
         if not ray.wait([self._tasks[job]], timeout=0)[0]:
-            return "running"
+            return "running" if _size(job) > self._sizes[job] else "queued"
         try:
             ray.get(self._tasks.pop(job))
             self._ends[job] = "ended"
@@ -96,7 +99,7 @@ class RayExecutor:
         return jobs
 
     def state(self, job: str) -> str:
-        """See `Executor.state`; a task that waits for resources is "running", too."""
+        """See `Executor.state`."""
         return str(self._ask("state", job))
 
     def cancel(self, job: str) -> None:
@@ -129,6 +132,10 @@ def _connect(address: str | None) -> bool:
         ray.init(include_dashboard=False, **quiet)
         return False
     return True
+
+
+def _size(log: str) -> int:
+    return Path(log).stat().st_size if Path(log).exists() else 0
 
 
 def _execute(work: Work) -> int:
