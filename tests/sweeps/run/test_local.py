@@ -136,7 +136,8 @@ from sweeps.run import local
 if __name__ == "__main__":
     local.PRELOADED, folder = "json", Path(sys.argv[1])
     try:
-        print(local.run_command(("tests.sweeps.steps", "wait", str(folder / "pid")), folder / "log"))
+        words = ("tests.sweeps.steps", "wait", str(folder / "pid"))
+        print(local.run_command(words, folder / "log"))
     except KeyboardInterrupt:
         print("interrupted", flush=True)
 """
