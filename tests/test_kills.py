@@ -78,7 +78,9 @@ class Training:
     def wait_for_training(self, process: BaseProcess) -> None:
         """Until the process holds the lock of its run folder, or has ended."""
         while process.exitcode is None:
-            if any(f"process {process.pid} " in lock.read_text() for lock in self.place.glob("*/lock")):
+            if any(
+                f"process {process.pid} " in lock.read_text() for lock in self.place.glob("*/lock")
+            ):
                 return
             time.sleep(0.005)
 

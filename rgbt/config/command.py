@@ -18,7 +18,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rgbt.checks import InputError, nearest, split_list
+from rgbt.checks import InputError, RunError, nearest, split_list
 from rgbt.config.component import build
 from rgbt.config.compose import (
     OWN_FOLDERS,
@@ -39,6 +39,7 @@ from rgbt.runtime.group import taking_part
 from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")
+ONE_RUN = {"-r", "--run"}  # what is done without them
 
 # Groups that are not in the defaults list; a command adds them with a plus.
 ADDED = ("experiment", "search", "debug")
@@ -54,23 +55,17 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     """
 
     def decorate(main: Main) -> Callable[[], None]:
-        codes: list[int] = []
-
-        def checked(config: DictConfig, words: Sequence[str]) -> int | None:
-            check_keys(config)
-            overrides = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]
-            return main(config, overrides)
-
-        def point(config: DictConfig) -> None:
-            words = HydraConfig.get().overrides.task
-            codes.append(exit_code(lambda: checked(config, words), catch_interrupt=False))
+        point = Point(main)
 
         def run(words: list[str]) -> int | None:
             check_words(words)
-            if not any(word.startswith("-") for word in words):
+            options = {word for word in words if word.startswith("-")}
+            if options <= ONE_RUN:
+                words = [word for word in words if word not in options]
                 config, is_search = composed(words)
                 if not is_search:
-                    return checked(config, words)
+                    _check_launcher(words)
+                    return point.checked(config, words)
             if not any(word.startswith("hydra/sweeper=") for word in words):
                 first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
                 words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
@@ -84,7 +79,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
 
         @wraps(main)
         def entry() -> None:
-            codes.clear()
+            codes = point.begin()
             words = readable_paths(sys.argv[1:])
             with taking_part(), answered(), searching(words):
                 code = max([exit_code(lambda: run(words)), *codes])
@@ -93,6 +88,65 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
         return entry
 
     return decorate
+
+
+class Point:
+    """The task function of Hydra: runs one point of a grid.
+
+    A launcher that runs points in other processes, perhaps on other machines, sends a copy of it
+    there by pickle. The codes of failed points are in this process; a copy raises instead.
+    """
+
+    def __init__(self, main: Main) -> None:
+        self.main = main
+        self.codes: list[int] | None = None
+
+    def begin(self) -> list[int]:
+        """The list that gets the code of every point that runs in this process."""
+        self.codes = []
+        return self.codes
+
+    def checked(self, config: DictConfig, words: Sequence[str]) -> int | None:
+        """Call the command, without the words for Hydra itself."""
+        check_keys(config)
+        overrides = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]
+        return self.main(config, overrides)
+
+    def __call__(self, config: DictConfig) -> None:
+        """Run the point that Hydra has composed; see the class."""
+        words = HydraConfig.get().overrides.task
+        errors: list[Exception] = []
+
+        def work() -> int | None:
+            try:
+                return self.checked(config, words)
+            except Exception as error:
+                errors.append(error)
+                raise
+
+        code = exit_code(work, catch_interrupt=False)
+        if self.codes is not None:
+            self.codes.append(code)
+        elif code:
+            kind = InputError if code == 2 else RunError
+            raise kind(str(errors[0]) if errors else f"a point ended with code {code}.")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"main": self.main, OWN_FOLDERS: own_folders()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # The launcher composes the point where it runs, after it has read this copy.
+        self.main, self.codes = state["main"], None
+        os.environ[OWN_FOLDERS] = state[OWN_FOLDERS]
+        register_resolvers()
+
+
+def _check_launcher(words: Sequence[str]) -> None:
+    """Refuse a launcher for one run, which Hydra would ignore: the run would be trained here."""
+    for word in words:
+        key, _, name = word.lstrip("+").partition("=")
+        if key == "hydra/launcher" and name.strip("'\"") != "basic":
+            raise InputError(f"{word}: it is for several runs; add -m.")
 
 
 def words_of_run(overrides: Sequence[str]) -> list[str]:

@@ -1,7 +1,7 @@
 """Compose the configuration with Hydra, list its files, and register its resolvers.
 
-Each file is parsed once while a command runs, and each choice of files is composed once. Tables and
-searches set values on copies of it, which is thirty times faster.
+Each file is parsed once while a command runs (`hydra_plugins.rgbt_conf`), and each choice of files
+is composed once. Tables and searches set values on copies of it, which is thirty times faster.
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ import omegaconf.base
 import omegaconf.grammar_parser
 from hydra._internal import defaults_list
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
@@ -67,6 +65,12 @@ def searching(words: Sequence[str]) -> Iterator[None]:
 def own_folders() -> str:
     """Folders of the user's own files, as they were typed; "": none."""
     return os.environ.get(OWN_FOLDERS, "")
+
+
+def own_paths() -> list[str]:
+    """The same folders one by one."""
+    typed = (each.strip().strip("'\"") for each in own_folders().split(","))
+    return [each for each in typed if each]
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
@@ -131,9 +135,9 @@ def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
 
 
 @cache
-def _check_names(own: str) -> None:
+def _check_names(_own: str) -> None:
     """InputError: a file of the user is never read, because rgbt has one of its name."""
-    for folder in filter(None, (each.removeprefix("file://") for each in own.split(","))):
+    for folder in (each.removeprefix("file://") for each in own_paths()):
         if Path(folder).resolve() == conf_dir().resolve():
             continue
         for file in sorted(Path(folder).rglob("*.yaml")):
@@ -142,31 +146,13 @@ def _check_names(own: str) -> None:
                 raise InputError(f"{file}: rgbt has conf/{name}, and uses that; rename yours.")
 
 
-class _ParsedOnce(FileConfigSource):
-    """Copies of parsed files, which Hydra changes: parsing takes half of its time.
+def variants_of(file: Path) -> dict[str, dict[str, Any] | None]:
+    """The values of every variant of a file, by the end of its name; {} where it has none.
 
     A file may hold several choices of its group: ``_variants_: {b0: {...}}`` in cmx.yaml is the
     choice cmx_b0, whose values replace those of the file. Null is the file itself: ``{b2: null}``
     makes it the choice cmx_b2 instead of cmx.
     """
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        result: ConfigResult = pickle.loads(_parsed(self.path, self.provider, config_path))  # noqa: S301
-        return result
-
-    def is_config(self, config_path: str) -> bool:
-        return _place(self.path, config_path) is not None
-
-    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        found = set(super().list(config_path, results_filter))
-        if results_filter != ObjectType.GROUP:
-            files = Path(self.path, config_path).glob("*.yaml")
-            found |= {f"{file.stem}_{each}" for file in files for each in variants_of(file)}
-        return sorted(found)
-
-
-def variants_of(file: Path) -> dict[str, dict[str, Any] | None]:
-    """The values of every variant of a file, by the end of its name; {} where it has none."""
     return _variants(str(file), file.stat().st_mtime_ns)
 
 
@@ -179,7 +165,14 @@ def _variants(file: str, _changed: int) -> dict[str, dict[str, Any] | None]:
     return {str(key): values for key, values in plain[VARIANTS].items()}
 
 
-def _place(folder: str, name: str) -> tuple[Path, str | None] | None:
+def choices_in(group: Path) -> set[str]:
+    """Names of the choices in the folder of a group."""
+    files = [file for file in group.glob("*.yaml") if file.is_file()]
+    varied = {f"{file.stem}_{each}" for file in files for each in variants_of(file)}
+    return varied | {file.stem for file in files if None not in variants_of(file).values()}
+
+
+def place_of(folder: str, name: str) -> tuple[Path, str | None] | None:
     """The file of a choice such as "model/cmx_b0", and its variant; None: no such choice."""
     path = Path(folder, name.removesuffix(".yaml"))
     file = path.with_name(f"{path.name}.yaml")
@@ -194,9 +187,15 @@ def _place(folder: str, name: str) -> tuple[Path, str | None] | None:
     return None
 
 
+def parsed(folder: str, provider: str, name: str) -> ConfigResult:
+    """A copy of a parsed file, for Hydra, which changes it: parsing takes half of its time."""
+    result: ConfigResult = pickle.loads(_parsed(folder, provider, name))  # noqa: S301 - made below
+    return result
+
+
 @lru_cache(maxsize=4096)
 def _parsed(folder: str, provider: str, name: str) -> bytes:
-    source, place = FileConfigSource(provider, folder), _place(folder, name)
+    source, place = FileConfigSource(provider, folder), place_of(folder, name)
     if place is None:  # Hydra's own message
         return pickle.dumps(source.load_config(name))
     result = source.load_config(str(place[0].relative_to(folder)))
@@ -209,7 +208,7 @@ def _parsed(folder: str, provider: str, name: str) -> bytes:
 
 def load_choice(name: str) -> dict[str, Any]:
     """The values of a choice of ``conf/`` with its defaults, not resolved: "model/cmx_b0"."""
-    result = pickle.loads(_parsed(str(conf_dir()), "conf", name))  # noqa: S301
+    result = parsed(str(conf_dir()), "conf", name)
     return cast("dict[str, Any]", OmegaConf.to_container(result.config))
 
 
@@ -225,7 +224,7 @@ def groups() -> list[str]:
 
 @cache
 def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
-    """Cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
+    """Cached, because Hydra needs 20 ms. The search path has `_own` from the environment."""
     with own_hydra():
         return tuple(
             GlobalHydra.instance().config_loader().get_group_options(group, kind, "config")
@@ -273,7 +272,7 @@ def own_hydra() -> Iterator[None]:
 
 
 def register_resolvers() -> None:
-    """Register what configuration files may use, and the source that parses them once.
+    """Register what configuration files may use; on a node too, before they are read there.
 
     ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
     ``${by_network:{CMX:start_cmx}}``: of the class of the network, with ``_heads`` and ``_rotary``.
@@ -282,8 +281,6 @@ def register_resolvers() -> None:
     ``${first:${.crop_hw}}``: the first entry of a list, which may itself be resolved; null of null.
     ``${embedded:120,null}``: 120 for an embedded data set, null for images of the user.
     """
-    Plugins.instance()  # registers Hydra's own sources, once
-    SourcesRegistry.instance().types["file"] = _ParsedOnce
     defaults_list._create_interpolation_map = _choices_of_children  # type: ignore[assignment]
     omegaconf.base.parse = _parsed_text  # type: ignore[attr-defined]
     resolvers: dict[str, Callable[..., Any]] = {

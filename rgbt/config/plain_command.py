@@ -70,7 +70,10 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             return say(str(stop), stop.code)
         return say("interrupted; rerun the command to resume.", 130)  # a second Ctrl-C
     except Exception as error:
-        if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
+        library = type(error).__module__.partition(".")[0]
+        if library == "submitit":  # a job that was lost, or reached its time limit
+            return say(str(error), 1)
+        if library in ("hydra", "omegaconf"):
             from rgbt.config.command import hydra_sentence  # --help does not wait for Hydra
 
             words = [word for word in sys.argv[1:] if not word.startswith("-")]

@@ -61,6 +61,7 @@ class Driver:
 
     def __post_init__(self) -> None:
         self._began, self._has_reported_cores = time.monotonic(), False
+        self._is_drained = False  # the source has nothing more until a point ends
 
     def run(self) -> None:
         """Execute points until none is left; with ``wait=false`` until all free ones are queued.
@@ -79,6 +80,7 @@ class Driver:
     def _step(self) -> bool:
         """Look at all jobs, and submit new ones; whether there is more to do."""
         ended = [point for point in self.running if self._advance(point)]
+        self._is_drained = self._is_drained and not ended
         self.running = [point for point in self.running if point not in ended]
         new = self._submit()
         self.view.update(self.running, self.source.counts())
@@ -100,15 +102,17 @@ class Driver:
         """Hand free points to the executor, all at once; whether there were any."""
         tasks, works = list[Task](), list[Work]()
         while len(self.running) + len(works) < self.executor.slots and not self._is_over():
-            task = self.source.next()
+            task = None if self._is_drained else self.source.next()
+            self._is_drained = task is None
             if task is None:
                 break
-            try:
-                works.append(work_of(task.plan, self.runs, self.settings.trust))
+            work, end = self._look(task)
+            if work is None:
+                self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
+                self.source.record(task, end)
+            else:
+                works.append(work)
                 tasks.append(task)
-            except RunError as error:  # its finished run is of other images
-                self.source.record(task, End("failed", str(error)))
-                self.view.say("failed", f"{task.plan.point.label}: {error}")
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
         jobs = self.executor.submit(works) if works else []
@@ -118,6 +122,22 @@ class Driver:
                 self.view.say("queued", f"{task.plan.point.label}, job {job}")
         self._report_cores()
         return bool(tasks)
+
+    def _look(self, task: Task) -> tuple[Work | None, End]:
+        """What a point lacks; None: nothing, and how it ended."""
+        try:
+            work = work_of(task.plan, self.runs, self.settings.trust)
+            results = () if work.steps else self.runs.of_point(task.plan)
+        except RunError as error:  # its finished run is of other images
+            return None, End("failed", str(error))
+        if work.steps:
+            return work, End("finished")
+        # Its job ended while no driver looked.
+        RunningPoint(task, "", work.log, 0).read(self.runs.runs_dir)
+        for result in results:
+            self.runs.tag(result, task.plan.point.tags)
+        seconds = sum(result.result.get("seconds_of_last_process", 0.0) for result in results)
+        return None, End("finished", results=results, seconds=round(seconds, 1))
 
     def _stop(self) -> None:
         for point in self.running:

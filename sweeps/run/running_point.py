@@ -126,8 +126,7 @@ class RunningPoint:
             self.is_started, self._began = True, time.monotonic()
         elif state == "queued" and self.is_started:
             self._ran, self.is_started = self.seconds, False
-        self._read_metrics(runs.runs_dir)
-        reason = self._report()
+        reason = self.read(runs.runs_dir)
         if state not in ("queued", "running"):
             found = self._end or self._how_ended(state, runs)
             return replace(found, seconds=round(self.seconds, 1))
@@ -165,32 +164,32 @@ class RunningPoint:
         )
         return End("failed", reason or changed)
 
-    def _read_metrics(self, runs_dir: Path) -> None:
-        """Read whole lines of new steps; a run that resumes repeats those before its checkpoint."""
+    def read(self, runs_dir: Path) -> str:
+        """Read what its runs have written, and report it; why the point is pruned, or ""."""
         files = [runs_dir / run.key / "metrics.jsonl" for run in self.task.plan.runs]
         size = sum(file.stat().st_size for file in files if file.exists())
-        if size == self._size:
-            return
-        is_first, self._size, self.step = not self._size, size, 0
-        for place, file in enumerate(files):
-            lines = list[MetricLine]()
-            # It may not exist yet; the run itself reports a damaged line when it resumes.
-            with suppress(FileNotFoundError, ValueError):
-                lines = MetricLine.read_all(file.read_bytes().split(b"\n")[:-1])
-            self.step += lines[-1].step if lines else 0
-            validations = [line for line in lines if line.kind == "val"]
-            if validations:
-                self.score = validations[-1].values.get("mIoU", math.nan)
-            if place == 0:
-                self._unreported += [each for each in validations if each.step > self._validated]
-                self._validated = max([self._validated, *(each.step for each in validations)])
-
-        if is_first:
-            self._first = (time.monotonic(), self.step)
-
-    def _report(self) -> str:
+        if size != self._size:
+            is_first, self._size, self.step = not self._size, size, 0
+            for file in files:
+                self._read_metrics(file, is_reported=file is files[0])
+            if is_first:
+                self._first = (time.monotonic(), self.step)
         while self._unreported and self.task.report is not None:
             if reason := self.task.report(self._unreported[0]):
                 return reason
             del self._unreported[0]
         return ""
+
+    def _read_metrics(self, file: Path, *, is_reported: bool) -> None:
+        """Read whole lines of new steps; a run that resumes repeats those before its checkpoint."""
+        lines = list[MetricLine]()
+        # It may not exist yet; the run itself reports a damaged line when it resumes.
+        with suppress(FileNotFoundError, ValueError):
+            lines = MetricLine.read_all(file.read_bytes().split(b"\n")[:-1])
+        self.step += lines[-1].step if lines else 0
+        validations = [line for line in lines if line.kind == "val"]
+        if validations:
+            self.score = validations[-1].values.get("mIoU", math.nan)
+        if is_reported:
+            self._unreported += [line for line in validations if line.step > self._validated]
+            self._validated = max([self._validated, *(line.step for line in validations)])
