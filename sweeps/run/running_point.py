@@ -79,7 +79,7 @@ class RunningPoint:
         job: its name at the executor.
         log: output of the job, which begins behind byte `begin`.
         timeout_s: limit of the job from its start.
-        is_started: whether the job runs, and does not wait for its turn, for the first time or again.
+        is_started: whether the job runs, and does not wait for its turn, the first one or another.
         step: optimiser steps done by all its runs, of `steps`.
         score: last mIoU on the selection split, a fraction.
     """
