@@ -143,3 +143,8 @@ def check(sweep: Sweep, straight: Sweep, seeds: str = "0123") -> None:
 def resumed_at(text: str) -> list[int]:
     """Steps at which the commands in a log resumed their runs."""
     return [int(step) for step in re.findall(r"resumes at step (\d+)", text)]
+
+
+def saved_at(text: str) -> list[int]:
+    """Steps at which commands were stopped, by their log."""
+    return [int(step) for step in re.findall(r"SIGTERM at step (\d+), and the checkpoint", text)]
