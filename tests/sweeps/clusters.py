@@ -143,6 +143,7 @@ def ray_cluster() -> Iterator[Any]:
     pytest.importorskip("ray", reason="Ray is missing: pip install -e '.[dev]'")
     from ray.cluster_utils import Cluster
 
+    before = signal.getsignal(signal.SIGTERM)  # Ray sets its own
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.delenv("RAY_ADDRESS", raising=False)
@@ -152,3 +153,4 @@ def ray_cluster() -> Iterator[Any]:
             yield cluster
         finally:
             cluster.shutdown()
+            signal.signal(signal.SIGTERM, before)

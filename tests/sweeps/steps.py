@@ -24,6 +24,7 @@ def facts() -> str:
         "given": os.environ.get("GIVEN"),
         "folder": str(Path.cwd()),
         "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
+        "grandparent": Path(f"/proc/{os.getppid()}/stat").read_text().rpartition(")")[2].split()[1],
         "interrupt": signal.getsignal(signal.SIGINT) is signal.default_int_handler,
     }
     return json.dumps(known)
