@@ -80,15 +80,17 @@ def test_openmp_of_the_runs_of_a_sweep_has_read_the_value(
 ) -> None:
     words = ("-c", SWEEP.format(workers=workers))
     assert read_by_openmp(*words, folder=tmp_path) == {expected}
-    assert (tmp_path / "log").read_text().startswith("The Zen of Python")
+    assert "\nThe Zen of Python" in (tmp_path / "log").read_text()
 
 
 SWEEP = """
 import time
 from pathlib import Path
-from sweeps.run.processes import LocalExecutor
-job = LocalExecutor({workers}).start(["this"], {{}}, Path("log"))
-while job.poll() is None:
+from sweeps.run.job import Step, Work
+from sweeps.run.local import LocalExecutor
+executor = LocalExecutor({workers})
+(job,) = executor.submit([Work("key", (Step(("this",), Path()),), {{}}, Path("log"), Path.cwd())])
+while executor.state(job) == "running":
     time.sleep(0.05)
 """
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
 import signal
 import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +21,7 @@ from mlflow.tracking import MlflowClient
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
-from sweeps.run.processes import LocalExecutor, LocalJob
+from sweeps.run.local import CWD_LAST, PRELOADED, _command
 from tests.checkpoints.test_torch_files import same
 from tests.commands import only_run
 from tests.conftest import write_data
@@ -40,18 +44,26 @@ SETTINGS = (
 ENDINGS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib")
 
+FORKS = multiprocessing.get_context("forkserver")
+
+
+def run(words: Sequence[str], variables: Mapping[str, str], log: str) -> None:
+    """In a process of its own, the leader of a group: a command as that of a local job."""
+    os.setsid()
+    _command(words, variables, log)
+
 
 @dataclass
 class Training:
     """One command that is rerun after every kill."""
 
     place: Path
-    executor: LocalExecutor
 
     def __post_init__(self) -> None:
         self.log = self.place / "log"
+        self.place.mkdir(exist_ok=True)
 
-    def start(self, instant: str = "-") -> LocalJob:
+    def start(self, instant: str = "-") -> BaseProcess:
         root = self.place.parent
         words = (
             *(f"tracking.uri=sqlite:///{root / 'mlflow.db'}", f"dataset.root={root / 'mf'}"),
@@ -59,21 +71,23 @@ class Training:
             "data.num_workers=0",
         )
         command = ("tests.dying", instant, "rgbt.run", *SETTINGS, *words)
-        return self.executor.start(command, {"OMP_NUM_THREADS": "1"}, self.log)
+        process = FORKS.Process(target=run, args=(command, {"OMP_NUM_THREADS": "1"}, str(self.log)))
+        process.start()
+        return process
 
-    def wait_for_training(self, job: LocalJob, pid: int) -> None:
+    def wait_for_training(self, process: BaseProcess) -> None:
         """Until the process holds the lock of its run folder, or has ended."""
-        while job.poll() is None:
-            if any(f"process {pid} " in lock.read_text() for lock in self.place.glob("*/lock")):
+        while process.exitcode is None:
+            if any(
+                f"process {process.pid} " in lock.read_text() for lock in self.place.glob("*/lock")
+            ):
                 return
             time.sleep(0.005)
 
-    def end(self, job: LocalJob) -> int:
-        deadline = time.monotonic() + 300
-        while (code := job.poll()) is None:
-            assert time.monotonic() < deadline, "hangs"
-            time.sleep(0.005)
-        return code
+    def end(self, process: BaseProcess) -> int:
+        process.join(300)
+        assert process.exitcode is not None, "hangs"
+        return process.exitcode
 
     def finish(self) -> Path:
         assert self.end(self.start()) == 0, self.log.read_text()[-3000:]
@@ -82,7 +96,6 @@ class Training:
 
 class Bench(NamedTuple):
     root: Path
-    executor: LocalExecutor
     undisturbed: Path
     seconds: float
 
@@ -91,11 +104,11 @@ class Bench(NamedTuple):
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     root = tmp_path_factory.mktemp("kills")
     write_data(root / "mf", IMAGES, (64, 64))
-    executor = LocalExecutor()
-    Training(root / "first", executor).finish()  # starts the fork server and makes the store
+    FORKS.set_forkserver_preload([CWD_LAST, PRELOADED])
+    Training(root / "first").finish()  # starts the fork server and makes the store
     began = time.monotonic()
-    straight = Training(root / "straight", executor).finish()
-    return Bench(root, executor, straight, time.monotonic() - began)
+    straight = Training(root / "straight").finish()
+    return Bench(root, straight, time.monotonic() - began)
 
 
 def lines(folder: Path) -> list[Any]:
@@ -144,22 +157,20 @@ def check(bench: Bench, place: Path) -> None:
 def test_killed_at_random_instants(bench: Bench) -> None:
     """Six kills; by the process or its whole group."""
     draw = random.Random(0)
-    training = Training(bench.root / "random", bench.executor)
+    training = Training(bench.root / "random")
     inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])
     for _ in range(6):
-        job = training.start()
-        pid = job._process.pid
-        assert pid is not None
+        process = training.start()
+        assert process.pid is not None
         number = draw.choice(ENDINGS)
         trains = draw.random() < 0.8  # killed while it trains, else at any moment
         if trains:
-            training.wait_for_training(job, pid)
+            training.wait_for_training(process)
         time.sleep(draw.uniform(0.0, 1.0) * (inside if trains else bench.seconds))
-        if draw.random() < 0.5:
-            job._signal(number)
-        elif job.poll() is None:
-            os.kill(pid, number)
-        code = training.end(job)
+        is_group = draw.random() < 0.5
+        with suppress(ProcessLookupError):  # before it leads a group, or when it has ended
+            (os.killpg if is_group else os.kill)(process.pid, number)
+        code = training.end(process)
         # Before the command answers signals: as the system does, or Python for Ctrl-C.
         early = {-number, 1} if number == signal.SIGINT else {-number}
         assert code in {0, 128 + number} | early, training.log.read_text()[-3000:]
@@ -176,7 +187,7 @@ INSTANTS = (
 @pytest.mark.parametrize("instant", INSTANTS)
 def test_killed_between_two_writes(bench: Bench, instant: str) -> None:
     name = instant.replace(" ", "_").replace("/", "_")
-    training = Training(bench.root / name, bench.executor)
+    training = Training(bench.root / name)
     code = training.end(training.start(instant))
     assert code == -signal.SIGKILL, training.log.read_text()[-3000:]
     training.finish()

@@ -93,8 +93,8 @@ class Driver:
     def _advance(self, point: RunningPoint) -> bool:
         was_started, label = point.is_started, point.task.plan.point.label
         end = point.advance(self.executor, self.runs)
-        if point.is_started and not was_started:
-            self.view.say("started", label)
+        if point.is_started != was_started:
+            self.view.say("started" if point.is_started else "queued", label)
         if end is not None:
             end = self.source.record(point.task, end)
             self.view.ended(point, end.state, end.reason)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from rgbt.checks import one_line
 from rgbt.files.atomic import is_held
 from rgbt.runs.folder import is_finished
 from rgbt.runtime.group import end_with_parent
@@ -81,8 +82,10 @@ class Job:
         try:
             for step in self.work.steps:
                 code = code or self._execute(step)
-        except BaseException:  # a time limit, or Ray cancels: the run saves its step first
+        except BaseException as error:  # a time limit, or Ray cancels: the run saves its step first
             self.stop()
+            if isinstance(error, Exception):  # submitit: no more time limits
+                self._say(one_line(error))
             raise
         self._say(how_ended(code))
         return code
@@ -109,8 +112,11 @@ class Job:
         return Child(process.pid, process.wait)
 
     def _say(self, text: str) -> None:
-        with self.work.log.open("a") as log:
-            log.write(f"{SAYS}{text}\n")
+        with self.work.log.open("ab+") as log:
+            size = log.seek(0, os.SEEK_END)
+            log.seek(max(0, size - 1))
+            begin = "" if log.read(1) in (b"", b"\n") else "\n"  # a command was killed in a line
+            log.write(f"{begin}{SAYS}{text}\n".encode())
 
     def _execute(self, step: Step) -> int:
         lock, is_training = step.folder / "lock", step.words[0] == TRAINING
@@ -123,10 +129,10 @@ class Job:
                 return 128 + signal.SIGTERM
             if is_training and is_finished(step.folder):
                 return 0
-            self._child = self.start(step.words)
-            code = self._wait(self._child)
-            self._child.reap()
-            self._child = None
+            child = self._child = self.start(step.words)
+            code = self._wait(child)
+            self._child = None  # before it is reaped: a handler of a signal may come in between
+            child.reap()
             if code == 0 or not (is_training and is_held(lock)):
                 return code
 

@@ -21,6 +21,7 @@ from types import FrameType
 from rgbt.checks import InputError, RunError
 from rgbt.cores import sleep_while_waiting
 from rgbt.runs.source_code import counted_modules
+from rgbt.runtime.group import end_with_parent
 from sweeps.run.job import Child, Job, Step, Work, become, failure_reason
 from sweeps.settings import GpuSlot
 
@@ -113,6 +114,7 @@ def _execute(work: Work) -> None:
 
 
 def _command(words: Sequence[str], variables: Mapping[str, str], log: str) -> None:
+    end_with_parent(signal.SIGTERM)  # nobody would know of a run that goes on
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(variables)

@@ -19,7 +19,7 @@ LIBRARIES = (
     "torch",
     "hydra",
     "scipy.optimize",
-    "sweeps.run.processes",
+    "sweeps.run.local",
     "mlflow",
     "mlflow.store.tracking.sqlalchemy_store",
 )

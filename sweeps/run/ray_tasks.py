@@ -7,13 +7,14 @@ they run. Ray repeats the task of a lost node on another one, where its run resu
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import ray
 from annotated_types import Interval
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from rgbt.checks import InputError, RunError, one_line
 from rgbt.config.values import check_value
@@ -40,16 +41,19 @@ class Keeper:
 
     def __init__(self) -> None:
         self._tasks: dict[str, Any] = {}
+        self._begins: dict[str, int] = {}  # sizes of logs before, which grow when a task begins
         self._ends: dict[str, str] = {}
 
-    def submit(self, job: str, work: Work, resources: Mapping[str, Any]) -> None:
-        """Queue a job, unless it is queued or runs."""
-        if self.state(job) not in ("queued", "running"):
+    def submit(self, job: str, work: Work, resources: Mapping[str, Any], begin: int) -> int:
+        """Queue a job whose log has that size, unless it is queued or runs; the size when it was."""
+        if self.state(job) != "running":
             self._ends.pop(job, None)
+            self._begins[job] = begin
             self._tasks[job] = ray.remote(_execute).options(**resources).remote(work)
+        return self._begins[job]
 
     def state(self, job: str) -> str:
-        """See `Executor.state`."""
+        """See `Executor.state`; a task that waits for resources is "running", too."""
         if job not in self._tasks:
             return self._ends.get(job, "ended")
         if not ray.wait([self._tasks[job]], timeout=0)[0]:
@@ -83,21 +87,23 @@ class RayExecutor:
             "max_retries": settings.max_retries,
         }
         self._warn_if_too_large()
-        # On this node, so that the loss of another one does not end it.
-        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-        kept = {"name": KEEPER, "get_if_exists": True, "lifetime": "detached", "num_cpus": 0}
-        self._keeper = ray.remote(Keeper).options(**kept, scheduling_strategy=here).remote()
+        # On the head node: with the loss of that one, the cluster ends anyway.
+        head = {"num_cpus": 0, "resources": {"node:__internal_head__": 0.001}}
+        kept = {"name": KEEPER, "get_if_exists": True, "lifetime": "detached", **head}
+        self._keeper = ray.remote(Keeper).options(**kept).remote()
+        self._begins: dict[str, int] = {}
 
     def submit(self, works: Sequence[Work]) -> list[str]:
         """See `Executor.submit`."""
         jobs = [str(work.log) for work in works]
         for job, work in zip(jobs, works, strict=True):
-            self._ask("submit", job, work, self._resources)
+            self._begins[job] = self._ask("submit", job, work, self._resources, _size(job))
         return jobs
 
     def state(self, job: str) -> str:
-        """See `Executor.state`; a task that waits for resources is "running", too."""
-        return str(self._ask("state", job))
+        """See `Executor.state`."""
+        state = str(self._ask("state", job))
+        return "queued" if state == "running" and _size(job) <= self._begins[job] else state
 
     def cancel(self, job: str) -> None:
         """See `Executor.cancel`."""
@@ -118,6 +124,14 @@ class RayExecutor:
 
 def _connect(address: str | None) -> bool:
     """Whether there is a cluster; if none runs, and none is named, Ray is started here."""
+    answer = signal.getsignal(signal.SIGTERM)
+    try:
+        return _init(address)
+    finally:  # Ray's own answer prints a stack of C++, and its exit code is 15
+        signal.signal(signal.SIGTERM, answer)
+
+
+def _init(address: str | None) -> bool:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": 30}
     try:
@@ -129,6 +143,10 @@ def _connect(address: str | None) -> bool:
         ray.init(include_dashboard=False, **quiet)
         return False
     return True
+
+
+def _size(log: str) -> int:
+    return Path(log).stat().st_size if Path(log).exists() else 0
 
 
 def _execute(work: Work) -> int:

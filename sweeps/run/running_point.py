@@ -79,7 +79,7 @@ class RunningPoint:
         job: its name at the executor.
         log: output of the job, which begins behind byte `begin`.
         timeout_s: limit of the job from its start.
-        is_started: whether the job runs, and does not wait for its turn.
+        is_started: whether the job runs, and does not wait for its turn, the first one or another.
         step: optimiser steps done by all its runs, of `steps`.
         score: last mIoU on the selection split, a fraction.
     """
@@ -94,7 +94,7 @@ class RunningPoint:
     score: float = field(default=math.nan, init=False)
 
     def __post_init__(self) -> None:
-        self._began, self._has_begun = time.monotonic(), False
+        self._began, self._ran = time.monotonic(), 0.0  # seconds before it was queued again
         self._first = (math.inf, sys.maxsize)  # time and step at the first look at the metrics
         self._size, self._validated = 0, 0  # of the metrics, and step of the last one reported
         self._end: End | None = None  # of a point that is cancelled
@@ -103,8 +103,9 @@ class RunningPoint:
 
     @property
     def seconds(self) -> float:
-        """Since its job started; or was queued, as long as it waits."""
-        return time.monotonic() - self._began
+        """That its job has run; or has waited, as long as it has not run."""
+        now = 0.0 if self._ran and not self.is_started else time.monotonic() - self._began
+        return self._ran + now
 
     @property
     def seconds_left(self) -> float:
@@ -121,10 +122,10 @@ class RunningPoint:
         be reported is reported by the next call.
         """
         state = executor.state(self.job)
-        has_log = self.log.exists() and self.log.stat().st_size > self.begin
-        self.is_started = state == "running" and has_log  # not while it is queued again
-        if self.is_started and not self._has_begun:
-            self._has_begun, self._began = True, time.monotonic()
+        if state == "running" and not self.is_started:
+            self.is_started, self._began = True, time.monotonic()
+        elif state == "queued" and self.is_started:
+            self._ran, self.is_started = self.seconds, False
         reason = self.read(runs.runs_dir)
         if state not in ("queued", "running"):
             found = self._end or self._how_ended(state, runs)

@@ -79,6 +79,8 @@ class SubmititExecutor:
 
     def submit(self, works: Sequence[Work]) -> list[str]:
         """See `Executor.submit`; several jobs are one array."""
+        if self._cluster == "slurm" and any(record(work).is_file() for work in works):
+            self._ask()
         found = {work.key: self._queued_before(work) for work in works}
         new = [work for work in works if not found[work.key]]
         for work in new:
@@ -102,10 +104,16 @@ class SubmititExecutor:
         if self._cluster == "local":
             return "ended" if self._jobs[job].done() else "running"
         if time.monotonic() - self._asked_at > ASK_S:
-            self._asked_at = time.monotonic()
-            with suppress(OSError, subprocess.SubprocessError):  # a controller that is busy
-                self._states = states_of_slurm()
+            with suppress(RunError):  # a controller that is busy
+                self._ask()
         return self._states.get(job, "ended")
+
+    def _ask(self) -> None:
+        self._asked_at = time.monotonic()
+        try:
+            self._states = states_of_slurm()
+        except (OSError, subprocess.SubprocessError) as error:
+            raise RunError(f"slurm: {one_line(error)}; rerun the command.") from error
 
     def cancel(self, job: str) -> None:
         """See `Executor.cancel`."""
@@ -116,10 +124,11 @@ class SubmititExecutor:
 
     def _queued_before(self, work: Work) -> str:
         """The job of a point that an earlier driver has submitted and that has not ended; or ""."""
-        if self._cluster != "slurm" or not record(work).is_file():
+        # A job that was told to stop may still save its step; the next one waits for its run.
+        if self._cluster != "slurm" or not record(work).is_file() or stop_file(work).exists():
             return ""
         known = read_json(record(work), dict[str, str], "remove it").get("job", "")
-        is_there = JOB_ID.fullmatch(known) and self.state(known) in ("queued", "running")
+        is_there = JOB_ID.fullmatch(known) and self._states.get(known) in ("queued", "running")
         return known if is_there else ""
 
 

@@ -1,0 +1,219 @@
+"""Jobs of a real SLURM, whose commands only wait: signals, limits, drivers that come and go."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt.checks import RunError
+from sweeps.run import submitit_jobs as jobs
+from sweeps.run.job import Step, Work, failure_reason
+from sweeps.run.submitit_jobs import SubmititExecutor
+from tests.sweeps import clusters
+from tests.waiting import until
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(jobs.__file__).parents[2]
+STEPS = "tests.sweeps.steps"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def slurm() -> Iterator[None]:
+    pytest.importorskip("submitit", reason="submitit is missing: pip install -e '.[dev]'")
+    with clusters.slurm(), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setattr(jobs, "ASK_S", 0.2)
+        yield
+
+
+def slurm_executor(folder: Path, **options: Any) -> SubmititExecutor:
+    given = {"submitit_folder": str(folder / ".submitit" / "%j"), "timeout_min": 60}
+    return SubmititExecutor("slurm", {**given, "cpus_per_task": 1, **options}, None)
+
+
+def works(folder: Path, count: int = 1, what: str = "train") -> list[Work]:
+    """Points whose commands wait for a file "own.go" in their folders."""
+    found = []
+    for key in "abcd"[:count]:
+        place = folder / key
+        place.mkdir(exist_ok=True)
+        step = Step((STEPS, what, str(place / "own")), place)
+        found.append(Work(key, (step,), {}, folder / ".logs" / f"{key}.log", folder))
+    return found
+
+
+def begun(work: Work) -> int:
+    """How often its command has begun."""
+    file = work.steps[0].folder / "steps"
+    return len(file.read_text().splitlines()) if file.exists() else 0
+
+
+def go(*some: Work) -> None:
+    for work in some:
+        (work.steps[0].folder / "own.go").touch()
+
+
+def send(job: str, *signals: str) -> None:
+    for name in signals:
+        subprocess.run(["scancel", f"--signal={name}", job], check=True)
+
+
+def release(executor: SubmititExecutor, job: str) -> None:
+    """Start a job now that SLURM has queued again, which it does after two minutes."""
+
+    def starts() -> bool:
+        command = ["scontrol", "update", f"jobid={job}", "StartTime=now"]
+        subprocess.run(command, check=False, capture_output=True)
+        return executor.state(job) == "running"
+
+    until(lambda: executor.state(job) == "queued", "the job to be queued again", 0.1)
+    until(starts, "the job to start again", 0.5)
+
+
+def end(executor: SubmititExecutor, *some: str) -> list[str]:
+    """The states of jobs when they have ended."""
+
+    def ended() -> list[str]:
+        found = [executor.state(job) for job in some]
+        return [] if {"queued", "running"} & set(found) else found
+
+    found: list[str] = until(ended, f"the end of {some}", 0.1)
+    return found
+
+
+def listed(job: str) -> list[str]:
+    """The states that SLURM has of all jobs of an array."""
+    array = job.partition("_")[0]
+    command = ["squeue", "--noheader", "--array", "--states=all", "--format=%T", f"--jobs={array}"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+
+
+def test_several_points_are_one_array_and_one_is_queued_again(tmp_path: Path) -> None:
+    executor, points = slurm_executor(tmp_path), works(tmp_path, 3)
+    names = executor.submit(points)
+    assert names == [f"{names[0].partition('_')[0]}_{n}" for n in range(3)]
+    until(lambda: all(map(begun, points)), "the commands")
+    send(names[0], "USR2")  # as before the end of its time
+    send(names[2], "TERM", "USR2")  # as before another job takes its node
+    for job in names[0], names[2]:
+        release(executor, job)
+    until(lambda: begun(points[0]) == begun(points[2]) == 2, "both commands again")
+    go(*points)
+    assert end(executor, *names) == ["ended"] * 3
+    assert [begun(work) for work in points] == [2, 1, 2]
+    assert listed(names[0]) == ["COMPLETED"] * 3
+    assert [failure_reason(work.log, 0) for work in points] == [""] * 3
+
+
+def test_time_limits_that_a_job_may_reach(tmp_path: Path) -> None:
+    """The first one queues it again; after the second one it says why it ends."""
+    executor, points = slurm_executor(tmp_path, max_num_timeout=1, timeout_min=5), works(tmp_path)
+    (job,) = executor.submit(points)
+    until(lambda: begun(points[0]) == 1, "the command")
+    send(job, "USR2")
+    release(executor, job)
+    until(lambda: begun(points[0]) == 2, "the command")
+    send(job, "USR2")
+    assert end(executor, job) == ["ended"]
+    reason = failure_reason(points[0].log, 0)
+    assert reason == "Job not requeued because: timed-out too many times"
+
+
+def test_signal_of_the_first_moment_queues_again(tmp_path: Path) -> None:
+    """While the command of the job still starts."""
+    executor, points = slurm_executor(tmp_path), works(tmp_path)
+    (job,) = executor.submit(points)
+    until(points[0].log.exists, "the job")
+    send(job, "TERM", "USR2")
+    release(executor, job)
+    go(*points)
+    assert end(executor, job) == ["ended"]
+    assert failure_reason(points[0].log, 0) == ""
+
+
+def test_cancelled_by_the_user(tmp_path: Path) -> None:
+    executor, points = slurm_executor(tmp_path), works(tmp_path, 2)
+    names = executor.submit(points)
+    until(lambda: all(map(begun, points)), "the commands")
+    subprocess.run(["scancel", names[0]], check=True)
+    assert end(executor, names[0]) == ["cancelled"]
+    go(points[1])
+    assert end(executor, names[1]) == ["ended"]
+    assert failure_reason(points[1].log, 0) == ""
+
+
+def test_cancel_saves_what_runs_and_removes_what_waits(tmp_path: Path) -> None:
+    executor, points = slurm_executor(tmp_path, array_parallelism=1), works(tmp_path, 2)
+    names = executor.submit(points)
+    until(lambda: begun(points[0]), "the first command")
+    for job in names:
+        executor.cancel(job)
+    assert end(executor, *names) == ["ended", "cancelled"]
+    assert points[0].log.read_text().endswith("job: exit code 143\n")
+    # A stop that has been obeyed, or that nobody could obey, does not stop the next jobs.
+    names = executor.submit(points)
+    go(*points)
+    assert end(executor, *names) == ["ended", "ended"]
+    assert [begun(work) for work in points] == [2, 1]
+
+
+def test_next_driver_takes_over_what_is_queued_or_runs(tmp_path: Path) -> None:
+    points = works(tmp_path, 3)
+    first = slurm_executor(tmp_path, array_parallelism=1)
+    names = first.submit(points)
+    until(lambda: begun(points[0]), "the first command")
+    second = slurm_executor(tmp_path, array_parallelism=1)
+    assert second.submit(points) == names
+    assert [second.state(job) for job in names] == ["running", "queued", "queued"]
+    go(*points)
+    end(second, *names)
+    assert [begun(work) for work in points] == [1, 1, 1]
+    (again,) = slurm_executor(tmp_path).submit(points[:1])
+    assert again not in names, "one that has ended is not waited for"
+    end(second, again)
+
+
+def test_next_driver_does_not_wait_for_a_job_that_is_stopped(tmp_path: Path) -> None:
+    """The driver before was killed after it had stopped its jobs."""
+    points, executor = works(tmp_path), slurm_executor(tmp_path)
+    executor.submit(points)
+    until(lambda: begun(points[0]), "the command")
+    executor.cancel(executor.submit(points)[0])
+    (job,) = slurm_executor(tmp_path).submit(points)
+    go(*points)
+    assert end(executor, job) == ["ended"]
+    assert failure_reason(points[0].log, 0) == ""
+
+
+def test_silent_controller_is_no_end_of_a_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, executor = works(tmp_path), slurm_executor(tmp_path)
+    (job,) = executor.submit(points)
+    until(lambda: begun(points[0]), "the command")
+    until(lambda: executor.state(job) == "running", "its state")
+    broken = tmp_path / "bin"
+    broken.mkdir()
+    (broken / "squeue").write_text("#!/bin/sh\nexit 1\n")
+    (broken / "squeue").chmod(0o755)
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", f"{broken}{os.pathsep}{os.environ['PATH']}")
+        executor._asked_at = float("-inf")
+        assert executor.state(job) == "running"
+        with pytest.raises(RunError, match="squeue"):
+            slurm_executor(tmp_path).submit(points)
+    assert slurm_executor(tmp_path).submit(points) == [job]
+    go(*points)
+    end(executor, job)
+    assert begun(points[0]) == 1
+
+
+def test_submission_that_slurm_refuses(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="slurm: .*partition"):
+        slurm_executor(tmp_path, partition="none").submit(works(tmp_path))
