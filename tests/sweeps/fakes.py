@@ -340,7 +340,7 @@ class Desk:
     ) -> None:
         self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
         self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
-        self.planner = planner or FakePlanner()
+        self.planner: Any = planner or FakePlanner()
 
 
 class ListDesk(Desk):

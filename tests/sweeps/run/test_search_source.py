@@ -131,7 +131,8 @@ def test_a_stored_parameter_outside_the_space_is_not_composed(tmp_path: Path) ->
 def test_trials_of_a_killed_driver_go_on(tmp_path: Path, is_lasting: bool) -> None:
     executor = lasting(scored(0.4, 0.5, val=0.5), 2)
     executor.is_lasting = is_lasting
-    pruner, both = optuna.pruners.MedianPruner(), {"objectives": UP, "trials": 3}
+    pruner = optuna.pruners.MedianPruner()
+    both: dict[str, Any] = {"objectives": UP, "trials": 3}
     view = interrupt_when(lambda running: any(point.step for point in running))
     desk = SearchDesk(tmp_path, executor=executor, view=view, pruner=pruner, **both)
     with pytest.raises(KeyboardInterrupt):
