@@ -21,7 +21,7 @@ from rgbt.files.atomic import is_held
 from rgbt.runs.naming import TAGS
 from sweeps.evaluation import command_of, stored_at
 from sweeps.run.executors import Executor, open_executor
-from sweeps.run.job import TRAINING, Step, Work
+from sweeps.run.job import TRAINING, Step, Work, failed_before
 from sweeps.run.local import LocalExecutor
 from sweeps.run.planner import PlannedPoint
 from sweeps.run.progress import ProgressView
@@ -108,13 +108,13 @@ class Driver:
             self._is_drained = task is None
             if task is None:
                 break
-            work, end = self._look(task)
-            if work is None:
-                end = self.source.record(task, end)
-                self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
-            else:
-                works.append(work)
+            found = self._look(task)
+            if isinstance(found, Work):
+                works.append(found)
                 tasks.append(task)
+            else:
+                end = self.source.record(task, found)
+                self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
         jobs = self.executor.submit(works) if works else []
@@ -125,21 +125,25 @@ class Driver:
         self._report_cores()
         return bool(tasks)
 
-    def _look(self, task: Task) -> tuple[Work | None, End]:
-        """What a point lacks; None: nothing, and how it ended."""
+    def _look(self, task: Task) -> Work | End:
+        """What a point lacks, or how it ended before."""
         try:
             work = work_of(task.plan, self.runs, self.settings.trust)
-            results = () if work.steps else self.runs.of_point(task.plan)
+            if not work.steps:
+                return self._finished_before(task, work.log)
         except RunError as error:  # its finished run is of other images
-            return None, End("failed", str(error))
-        if work.steps:
-            return work, End("finished")
-        # Its job ended while no driver looked.
-        RunningPoint(task, "", work.log, 0).read(self.runs.runs_dir)
+            return End("failed", str(error))
+        reason = failed_before(work.log) if self.settings.retry == "none" else ""
+        return End("failed", reason) if reason else work
+
+    def _finished_before(self, task: Task, log: Path) -> End:
+        """The end of a point whose job ended while no driver looked."""
+        RunningPoint(task, "", log, 0).read(self.runs.runs_dir)
+        results = self.runs.of_point(task.plan)
         for result in results:
             self.runs.tag(result, task.plan.point.tags)
         seconds = sum(result.result.get("seconds_of_last_process", 0.0) for result in results)
-        return None, End("finished", results=results, seconds=round(seconds, 1))
+        return End("finished", results=results, seconds=round(seconds, 1))
 
     def _stop(self) -> None:
         for point in self.running:

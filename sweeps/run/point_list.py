@@ -231,7 +231,11 @@ def commands_line(points: PointList, settings: SweepSettings) -> str:
     """Write a line of shell for every point that is not finished; what was done, in a sentence."""
     source, lines = ListSource(points, settings, is_dry=True), list[str]()
     while (task := source.next()) is not None:
-        work = work_of(task.plan, points.runs, settings.trust)
+        try:
+            work = work_of(task.plan, points.runs, settings.trust)
+        except RunError as error:  # its finished run is of other images
+            info(f"{task.plan.point.label}: {error}")
+            continue
         variables = [f"{name}={value}" for name, value in work.environment.items() if value]
         steps = (["env", *variables, sys.executable, "-m", *step.words] for step in work.steps)
         lines.append(" && ".join(map(shlex.join, steps)))
