@@ -1,9 +1,7 @@
 """Names of the user attributes of trials and studies in Optuna's storage."""
 
 # Attributes of a trial
-KEY = "rgbt.key"  # key of its point, see `PlannedPoint.key`
 RUNS = "rgbt.runs"  # keys of its runs, one per seed
-OVERRIDES = "rgbt.overrides"  # those of `python -m rgbt.run`, without the seeds of replicates
 LABEL = "rgbt.label"  # the point as shown
 REASON = "rgbt.reason"  # why it failed or was pruned
 SECONDS = "rgbt.seconds"  # duration of its runs, all processes together

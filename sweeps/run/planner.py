@@ -11,11 +11,9 @@ from typing import Any
 from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import compose, with_pixels
-from rgbt.runs.provenance import without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
-from sweeps import attributes as names
 from sweeps.evaluation import stored_at
 from sweeps.point import Point
 
@@ -32,17 +30,6 @@ class PlannedPoint:
     key: str
     runs: tuple[RunSpec, ...]
     fingerprints: Mapping[str, str]
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """User attributes of a trial of the point."""
-        return {
-            names.KEY: self.key,
-            names.OVERRIDES: [without_passwords(word) for word in self.point.overrides],
-            names.RUNS: [run.key for run in self.runs],
-            names.PIXELS: self.runs[0].scale.pixel_factor,
-            names.LABEL: self.point.label,
-        }
 
     def is_evaluated(self, results: Sequence[RunResult]) -> bool:
         """Whether there are runs, and all further evaluations of them."""

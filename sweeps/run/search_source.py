@@ -67,8 +67,9 @@ class SearchSource:
                 self._end(trial.number, End("failed", str(error)))
                 self._say("failed", f"{point.label}: {error}")
                 continue
-            for name, value in plan.attributes.items():
-                trial.set_user_attr(name, value)
+            trial.set_user_attr(names.LABEL, plan.point.label)
+            trial.set_user_attr(names.RUNS, [run.key for run in plan.runs])
+            trial.set_user_attr(names.PIXELS, plan.runs[0].scale.pixel_factor)
             return Task(plan, trial.number, self._pruning_callback(trial))
         return None
 

@@ -49,8 +49,6 @@ def test_the_sampler_is_asked_and_the_point_noted(tmp_path: Path) -> None:
     (trial,) = desk.trials
     assert trial.params == {"x": x}
     assert trial.user_attrs == {
-        names.KEY: task.plan.key,
-        names.OVERRIDES: [override],
         names.RUNS: [task.plan.key],
         names.LABEL: f"#0 x={x:.4g}",
         names.PIXELS: 1.0,
