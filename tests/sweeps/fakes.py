@@ -271,7 +271,7 @@ class FakeExecutor:
 
 
 def lasting(behaviour: Behaviour = succeed, slots: int = 9) -> FakeExecutor:
-    """A cluster: its jobs go on without the driver."""
+    """A cluster: its jobs continue without the driver."""
     made = FakeExecutor(behaviour, slots)
     made.is_lasting = True
     return made
