@@ -111,6 +111,8 @@ def read_settings(node: DictConfig, launcher: Launcher) -> SweepSettings:
         is_config = OmegaConf.is_config(value)
         plain[key] = OmegaConf.to_container(value, resolve=True) if is_config else value
     settings = cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))
+    if not settings.wait and launcher.name in ("basic", "submitit_local"):
+        raise InputError("hydra.sweeper.wait=false: runs of this machine end with the command.")
     return replace(settings, launcher=launcher)
 
 

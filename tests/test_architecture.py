@@ -60,10 +60,10 @@ COMMAND = {"config", "data"}
 ROOMS = {
     "sweeps.run": {"sweeps.space"},
     "sweeps.space": set(),
-    "sweeps.report": {f"sweeps.{e}" for e in ("worker", "table", "verdicts", "rendering")},
+    "sweeps.report": {f"sweeps.{e}" for e in ("run", "table", "verdicts", "rendering")},
     "sweeps.table": {"sweeps.run"},
     "sweeps.verdicts": {"sweeps.table", "sweeps.run"},
-    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "verdicts")},
+    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "run", "verdicts")},
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},
@@ -77,6 +77,7 @@ OUTSIDE = {
         "analysis",
         "rgbt.evaluation.profile",
         "rgbt.evaluation.profiled_network",
+        "rgbt.runtime.group",
     }
     | {f"rgbt.{each}" for each in READING - {"data", "geometry"}},
     "analysis": {f"rgbt.{each}" for each in READING - {"geometry"}},

@@ -25,10 +25,10 @@ from rgbt.tracking.sync import entry as sync
 from sweeps.claims import entry as claims
 from sweeps.report.__main__ import entry as report
 from sweeps.reproduce import entry as reproduce
+from sweeps.run.optuna_study import open_storage, storage_url, study_folder
 from sweeps.study import entry as study
 from sweeps.table.request import REQUESTED, TAG
 from sweeps.verdicts import stored
-from sweeps.run import storage
 from tests.commands import Call, Trained, short
 from tests.measured import remeasured
 
@@ -121,7 +121,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, trained: Trained) -> Path:
         add(RunResult(folder), root / "results")
         RunFolder(folder).write_config(config.replace(old, new, 1))
     (root / "runs" / "__init__.py").write_text(mark)
-    opened = storage.open_storage(None, root / "runs")
+    study_folder(root / "runs", "s").mkdir(parents=True)
+    opened = open_storage(storage_url(None, root / "runs", "s"))
     made = optuna.create_study(study_name="s", storage=opened)
     key, value = words[0].split("=", 1)
     made.add_trial(

@@ -41,6 +41,8 @@ RUN = [
     *(("model.width", "'model.width': expected KEY=VALUE"), ("=3", "'=3': expected KEY=VALUE")),
     ("model.width=[1", "'model.width=[1': no viable alternative"),
     ("-m hydra.sweeper.study=nan seed=0,1", "'hydra.sweeper.study': expected a finite value"),
+    ("-m hydra/launcher=joblib seed=0,1", "its n_jobs is hydra.sweeper.workers"),
+    ("-m hydra.sweeper.wait=false seed=0,1", "hydra.sweeper.wait=false"),
     ("transform.crop_hw=[48,inf]", "'transform.crop_hw[1]': expected a finite value, got inf"),
     ("hydra.searchpath=[/no/where]", "the folder /no/where does not exist"),
     ("trainer.accelerator=gpu", "'trainer.accelerator': write cuda"),

@@ -44,6 +44,13 @@ ONE_RUN = {"-r", "--run"}  # what is done without them
 # Groups that are not in the defaults list; a command adds them with a plus.
 ADDED = ("experiment", "search", "debug")
 
+# Launchers that are not installed with rgbt, and what is to be done.
+LAUNCHERS = {
+    "submitit_slurm": "it needs pip install 'rgbt[slurm]'",
+    "submitit_local": "it needs pip install 'rgbt[slurm]'",
+    "joblib": "its n_jobs is hydra.sweeper.workers",
+}
+
 Main = Callable[[DictConfig, list[str]], int | None]
 
 
@@ -195,6 +202,8 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
         if not error.options:
             return f"there is no group '{group or name}'; {nearest(group or name, groups())}."
+        if group == "hydra/launcher" and name in LAUNCHERS:
+            return f"hydra/launcher={name}: {LAUNCHERS[name]}."
         own = "" if own_folders() else f" For your own files set {SEARCH_PATH} or {OWN_FOLDERS}."
         return f"there is no {group} '{name}'; {nearest(name, error.options)}.{own}"
     if of_resolver := re.search(r"InputError raised while .*?: (.*?)( full_key:.*)?$", text):

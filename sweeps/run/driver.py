@@ -75,6 +75,8 @@ class Driver:
         except BaseException:
             if self.settings.stop_jobs or not self.executor.is_lasting:
                 self._stop()
+            elif self.running:
+                self.view.say("note", f"{len(self.running)} jobs continue without this command.")
             raise
 
     def _step(self) -> bool:
@@ -108,8 +110,8 @@ class Driver:
                 break
             work, end = self._look(task)
             if work is None:
+                end = self.source.record(task, end)
                 self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
-                self.source.record(task, end)
             else:
                 works.append(work)
                 tasks.append(task)

@@ -8,24 +8,19 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from rgbt.checks import InputError
+from rgbt.config.command import LAUNCHERS
 from sweeps.run.job import Work
 from sweeps.run.local import LocalExecutor
 from sweeps.settings import GpuSlot, Launcher
 
-# Launchers that work, and the package and the extra that they need.
-LAUNCHERS = {
-    "basic": None,
-    "submitit_local": ("submitit", "slurm"),
-    "submitit_slurm": ("submitit", "slurm"),
-    "ray": ("ray", "ray"),
-}
+WORKING = ("basic", "submitit_local", "submitit_slurm", "ray")
 
 
 class Executor(Protocol):
     """Executes points. A job is its name, which another driver of the study understands too."""
 
     slots: int  # jobs at the same time, queued ones included
-    is_lasting: bool  # whether jobs go on without the driver
+    is_lasting: bool  # whether jobs continue without the driver
 
     def submit(self, works: Sequence[Work]) -> list[str]:
         """Start or queue jobs; a point that has one already keeps it. RunError: not possible."""
@@ -40,13 +35,11 @@ class Executor(Protocol):
 def check_launcher(launcher: Launcher) -> None:
     """InputError: a launcher with which a sweep does not work, or its packages are missing."""
     name = launcher.name
-    if name not in LAUNCHERS:
-        hint = " Its n_jobs is hydra.sweeper.workers." if name == "joblib" else ""
-        known = ", ".join(LAUNCHERS)
-        raise InputError(f"hydra/launcher={name}: a sweep works with {known}.{hint}")
-    needed = LAUNCHERS[name]
-    if needed is not None and find_spec(needed[0]) is None:
-        raise InputError(f"hydra/launcher={name} needs: pip install 'rgbt[{needed[1]}]'.")
+    if name not in WORKING:
+        hint = f" ({LAUNCHERS[name]})" if name in LAUNCHERS else ""
+        raise InputError(f"hydra/launcher={name}: a sweep works with {', '.join(WORKING)}{hint}.")
+    if name == "ray" and find_spec("ray") is None:
+        raise InputError("hydra/launcher=ray: it needs pip install 'rgbt[ray]'.")
 
 
 def open_executor(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -37,7 +37,7 @@ class PointList:
         planner: plans them, with the overrides that all have.
         more: further points, from the outcomes until now; requested when no point is waiting.
         rank: which waiting point is the next: the one of the highest rank, and `more` is requested
-            before each; None: they are run in their order.
+            after each end; None: they are run in their order.
     """
 
     study: str
@@ -71,9 +71,11 @@ class ListSource:
         self.errors: dict[int, str] = {}
         # Indices of equal points, by key; the first one is run.
         self._same: dict[str, list[int]] = {}
+        self._order: list[PlannedPoint] = []  # the different ones, in the order of execution
         self._running: set[str] = set()  # keys
         self._finished: dict[str, tuple[RunResult, ...]] = {}
         self._failed: dict[str, str] = {}  # key -> reason, or "": not in this command or before
+        self._is_changed = True  # a point has ended since `more` was requested
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -98,6 +100,7 @@ class ListSource:
             for index in indices:
                 plan = self._plans[index]
                 self._plans[index] = replace(plan, point=replace(plan.point, tags=merged))
+        self._order = [self._plans[indices[0]] for indices in self._same.values()]
         return len(self._same) > before
 
     def _plan(self, index: int, point: Point) -> None:
@@ -114,8 +117,10 @@ class ListSource:
     def next(self) -> Task | None:
         """See `Source.next`."""
         more, rank = self._list.more, self._list.rank
-        if more and rank:
+        if more and rank and self._is_changed:
+            self._is_changed = False
             self._add(more(self.outcomes()))
+            self._order.sort(key=lambda plan: rank(plan.point), reverse=True)
         task = self._next_waiting()
         # Points that were added before this command was stopped are finished: others follow them.
         while task is None and more and self._add(more(self.outcomes())):
@@ -123,7 +128,7 @@ class ListSource:
         return task
 
     def _next_waiting(self) -> Task | None:
-        for plan in self._different():
+        for plan in self._order:
             if self._outcome(plan).state == "waiting":
                 self._running.add(plan.key)
                 return Task(plan)
@@ -131,7 +136,7 @@ class ListSource:
 
     def record(self, task: Task, end: End) -> End:
         """See `Source.record`."""
-        key = task.plan.key
+        key, self._is_changed = task.plan.key, True
         self._running.discard(key)
         self._failed[key] = end.reason
         if end.state == "finished":
@@ -164,12 +169,6 @@ class ListSource:
                 outcome = replace(outcome, state=state, results=results)
             found.append(outcome)
         return found
-
-    def _different(self) -> Iterator[PlannedPoint]:
-        plans = (self._plans[indices[0]] for indices in self._same.values())
-        if (rank := self._list.rank) is None:
-            return plans
-        return iter(sorted(plans, key=lambda plan: rank(plan.point), reverse=True))
 
     def _outcome(self, plan: PlannedPoint) -> Outcome:
         """The state of a point by its run folders, and by the log of a job that failed."""

@@ -87,7 +87,10 @@ class SearchSource:
 
     def _next_trial(self) -> Trial | None:
         if self._left:
-            return self._left.pop(0)
+            trial = self._left.pop(0)
+            for name, distribution in self._space.items():  # of a driver killed while it asked
+                trial._suggest(name, distribution)
+            return trial
         total, known = self._settings.trials, self._study.get_trials(deepcopy=False)
         if total is not None and sum(trial.state.name != "WAITING" for trial in known) >= total:
             return None

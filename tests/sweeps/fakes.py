@@ -1,63 +1,53 @@
-"""Fakes of everything that trains: plans, runs, processes, a driver and its view."""
+"""Fakes of everything that trains: plans, runs, jobs, and what runs a list or a search of them."""
 
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
+import optuna
 import pytest
-import sqlalchemy
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.compose import conf_dir
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
-from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps import attributes as names
 from sweeps.evaluation import Words, measurement_of
-from sweeps.point import Point
-from sweeps.settings import Objective, SweepSettings
-from sweeps.space import build_sampler, parse_space
+from sweeps.point import Outcome, Point
 from sweeps.run import driver as drivers
-from sweeps.run.driver import Driver
+from sweeps.run import point_list
+from sweeps.run.job import SAYS, STARTED, TRAINING, Work, how_ended
+from sweeps.run.optuna_study import open_study
 from sweeps.run.planner import PlannedPoint
-from sweeps.run.point_list import ListSource, PointList
+from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
-from sweeps.run.running_trial import RunningTrial
-from sweeps.run.storage import STALE_S, TrialStore, open_storage, open_study
-from sweeps.run.trial_sources import SamplerSource
+from sweeps.run.running_point import RunningPoint
+from sweeps.run.search_source import SearchSource
+from sweeps.settings import Launcher, Objective, SweepSettings, read_settings
+from sweeps.space import build_sampler, parse_space
 from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"
-DEADLINE_S = 180.0
-"""Generous: the machine may be busy. Nothing waits for it but a test that fails."""
 
 
 def settings(**changes: Any) -> SweepSettings:
-    """Settings of a sweep, as in study.yaml but for `changes`."""
-    none = ("storage", "gpus", "timeout_minutes", "study", "pruner", "trials")
-    plain: dict[str, Any] = {
-        **dict.fromkeys((*none, "hours")),
-        "workers": 1,
-        "retry": "none",
-        "wait": False,
-        "dry_run": False,
-        "params": {},
-        "points": (),
-        "space": {},
-        "objectives": (Objective("test/mIoU", "maximize"),),
-        "sampler": {"_target_": "optuna.samplers.RandomSampler", "seed": 0},
-        "replicates": 1,
-        "trust": "",
-    }
-    return SweepSettings(**{**plain, **changes})
+    """Settings of a sweep, as in study.yaml but for `changes` and the first two."""
+    file = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
+    assert isinstance(file, DictConfig)
+    objectives = (Objective("test/mIoU", "maximize"),)
+    sampler = {"_target_": "optuna.samplers.RandomSampler", "seed": 0}
+    plain = read_settings(file, Launcher())
+    return replace(plain, **{"objectives": objectives, "sampler": sampler, **changes})
 
 
 def key_of(overrides: Sequence[str]) -> str:
@@ -97,13 +87,6 @@ class FakePlanner:
         return plan_of(point)
 
 
-class PickyPlanner:
-    """Takes no point."""
-
-    def plan(self, point: Point) -> PlannedPoint:
-        raise InputError("x does not fit.")
-
-
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:
     """One image of one region and two classes."""
     array = np.array([[[[right, 4 - right], [0, 4]]]])
@@ -135,32 +118,23 @@ def finish(
     run = RunFolder(folder)
     run.describe(Description(f"fake {folder.name}", {"rgbt.key": folder.name, **(tags or {})}, {}))
     counts(dataset=dataset).save(run.path / counts_name("test"))
-    run.finish(
-        {
-            "name": f"fake {folder.name}",
-            "key": folder.name,
-            "dataset": dataset,
-            "steps": 4,
-            "best_step": 4,
-            "seconds_of_last_process": 2.5,
-            "val": {"mIoU": 0.5} if val is None else dict(val),
-            "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
-        }
-    )
+    scores = {
+        "val": {"mIoU": 0.5} if val is None else dict(val),
+        "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
+    }
+    known = {"name": f"fake {folder.name}", "key": folder.name, "dataset": dataset}
+    run.finish({**known, "steps": 4, "best_step": 4, "seconds_of_last_process": 2.5, **scores})
     return run
 
 
-@dataclass
+@dataclass(frozen=True)
 class Call:
-    """A requested process, and the folder of the run that it trains."""
+    """A command of a job, and the folder of its run."""
 
     module: str
     words: tuple[str, ...]
-    environment: dict[str, str]
-    log: Path
     folder: Path
-    attempt: int
-    stops: int = 0
+    log: Path
 
     def value(self, name: str) -> str:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
@@ -215,9 +189,10 @@ def hang(call: Call) -> Generator[None, None, NoReturn]:
         yield
 
 
-def first(*behaviours: Behaviour) -> Behaviour:
-    """The n-th process of a run behaves as the n-th says; later ones as the last."""
-    return lambda call: behaviours[min(call.attempt, len(behaviours) - 1)](call)
+def nth(*behaviours: Behaviour) -> Behaviour:
+    """The n-th command behaves as the n-th says."""
+    left = iter(behaviours)
+    return lambda call: next(left)(call)
 
 
 def only(word: str, behaviour: Behaviour, others: Behaviour = succeed) -> Behaviour:
@@ -228,194 +203,205 @@ def only(word: str, behaviour: Behaviour, others: Behaviour = succeed) -> Behavi
 class FakeJob:
     """Goes one step further with every look at it."""
 
-    def __init__(self, call: Call, process: Process) -> None:
-        self.call = call
-        self._process = process
-        self._code: int | None = None
+    def __init__(self, work: Work, executor: FakeExecutor) -> None:
+        self.work, self.is_stopped, self.end = work, False, ""
+        self._executor, self._process = executor, self._execute()
 
-    def poll(self) -> int | None:
-        if self._code is None and self.call.stops:
-            self._code = -15
-        if self._code is None:
-            try:
-                next(self._process)
-            except StopIteration as end:
-                self._code = end.value
-        return self._code
+    def _say(self, text: str) -> None:
+        self.work.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.work.log.open("a") as log:
+            log.write(f"{SAYS}{text}\n")
 
-    def stop(self) -> None:
-        self.call.stops += 1
+    def _execute(self) -> Generator[None, None, None]:
+        self._say(f"{STARTED} on fake")
+        code = 0
+        for step in self.work.steps:
+            module, *words = step.words
+            if module != TRAINING or not is_finished(step.folder):
+                call = Call(module, tuple(words), step.folder, self.work.log)
+                self._executor.calls.append(call)
+                code = yield from self._executor.behaviour(call)
+            if code:
+                break
+        self._say(how_ended(code))
+
+    def look(self) -> str:
+        if self.is_stopped and self.end != "ended":
+            self._say(how_ended(143))
+            self.end = "ended"
+        elif next(self._process, "ended"):
+            self.end = "ended"
+        return self.end or "running"
 
 
 class FakeExecutor:
-    """Makes fake processes; `calls` are all requested ones, in order."""
+    """Simulates jobs; `submits` are the keys of every submission, `calls` all commands."""
 
-    def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed) -> None:
-        self.runs_dir = runs_dir
-        self.behaviour = behaviour
+    def __init__(self, behaviour: Behaviour = succeed, slots: int = 1) -> None:
+        self.behaviour, self.slots, self.is_lasting = behaviour, slots, False
+        self.is_full, self.looks = False, 0  # whether jobs wait
+        self.submits: list[list[str]] = []
         self.calls: list[Call] = []
-        self.jobs: list[FakeJob] = []
+        self.jobs: dict[str, FakeJob] = {}
 
-    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> FakeJob:
-        module, *words = command
-        folder = self.runs_dir / key_of(words)
-        attempt = sum(call.words == tuple(words) for call in self.calls)
-        call = Call(module, tuple(words), dict(environment), log, folder, attempt)
-        self.calls.append(call)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.touch()
-        self.jobs.append(FakeJob(call, self.behaviour(call)))
-        return self.jobs[-1]
+    def submit(self, works: Sequence[Work]) -> list[str]:
+        self.submits.append([work.key for work in works])
+        return [self._job(work) for work in works]
+
+    def _job(self, work: Work) -> str:
+        known = [job for job, one in self.jobs.items() if one.work.key == work.key and not one.end]
+        job = known[0] if known and self.is_lasting else str(len(self.jobs))
+        self.jobs.setdefault(job, FakeJob(work, self))
+        return job
+
+    def state(self, job: str) -> str:
+        self.looks += 1
+        assert self.looks < 2000, "nobody ends this job"
+        is_queued = self.is_full and not self.jobs[job].is_stopped
+        return "queued" if is_queued else self.jobs[job].look()
+
+    def cancel(self, job: str) -> None:
+        self.jobs[job].is_stopped = True
 
     def started(self) -> list[tuple[str, ...]]:
         return [call.words for call in self.calls]
 
+    def stopped(self) -> list[str]:
+        return [name for name, job in self.jobs.items() if job.is_stopped]
 
-Look = Callable[[Sequence[RunningTrial]], None]
+
+def lasting(behaviour: Behaviour = succeed, slots: int = 9) -> FakeExecutor:
+    """A cluster: its jobs go on without the driver."""
+    made = FakeExecutor(behaviour, slots)
+    made.is_lasting = True
+    return made
+
+
+Look = Callable[[Sequence[RunningPoint]], object]
 
 
 class FakeView:
-    """Records its calls; `look` is called at every update with the works."""
+    """Records its calls; `look` is called at every update with the running points."""
 
-    def __init__(self, look: Look = lambda works: None) -> None:
+    def __init__(self, look: Look = len) -> None:
         self.ends: list[tuple[str, str, str]] = []
         self.said: list[tuple[str, str]] = []
-        self.update = look
+        self.counts: list[Mapping[str, int]] = []
+        self._look = look
 
-    def ended(self, work: RunningTrial, how: str, reason: str) -> None:
-        self.ends.append((work.plan.point.label, how, reason))
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def ended(self, point: RunningPoint, how: str, reason: str) -> None:
+        self.ends.append((point.task.plan.point.label, how, reason))
 
     def say(self, how: str, text: str) -> None:
         self.said.append((how, text))
 
+    def update(self, running: Sequence[RunningPoint], counts: Mapping[str, int]) -> None:
+        self.counts.append(dict(counts))
+        self._look(running)
 
-def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
+
+def interrupt_when(condition: Look) -> FakeView:
     """A view that acts like a user who presses Ctrl-C."""
 
-    def look(works: Sequence[RunningTrial]) -> None:
-        if condition(works):
+    def look(running: Sequence[RunningPoint]) -> None:
+        if condition(running):
             raise KeyboardInterrupt
 
     return FakeView(look)
 
 
-@dataclass
+@contextmanager
+def driven_by(executor: FakeExecutor, view: FakeView) -> Any:
+    """Drivers have this executor and this view, and look again at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drivers, "POLL_S", 0.0)
+        patch.setattr(drivers, "open_executor", lambda *_: executor)
+        patch.setattr(point_list, "ProgressView", lambda _: view)
+        yield
+
+
 class Desk:
-    """A driver with all that it needs; `plans` are those of a list."""
+    """A driver with all that it needs; `slots` are those of an executor that is not given."""
 
-    driver: Driver
-    store: TrialStore
-    executor: FakeExecutor
-    runs: RunStore
-    view: FakeView
-    plans: list[PlannedPoint] = field(default_factory=list)
+    def __init__(
+        self,
+        runs_dir: Path,
+        behaviour: Behaviour = succeed,
+        *,
+        executor: FakeExecutor | None = None,
+        view: FakeView | None = None,
+        slots: int = 1,
+        planner: Any = None,
+        **changes: Any,
+    ) -> None:
+        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
+        self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
+        self.planner = planner or FakePlanner()
 
-    @property
-    def source(self) -> Any:
-        return self.driver.source
 
-    def run(self) -> Desk:
-        self.driver.run()
+class ListDesk(Desk):
+    """A driver of a list of points, or of so many (x=0, x=1, ...)."""
+
+    def __init__(
+        self,
+        runs_dir: Path,
+        given: Sequence[Point] | int,
+        behaviour: Behaviour = succeed,
+        *,
+        study: str = "study",
+        more: Any = None,
+        rank: Any = None,
+        **others: Any,
+    ) -> None:
+        super().__init__(runs_dir, behaviour, **others)
+        self.given = tuple(points(given) if isinstance(given, int) else given)
+        self.keys = [plan_of(point).key for point in self.given]
+        what = (self.given, self.runs, self.planner, more, rank)
+        self.points = PointList(study, study, *what)
+        self.outcomes: list[Outcome] | None = None
+
+    def run(self, *, strict: bool = False) -> ListDesk:
+        with driven_by(self.executor, self.view):
+            self.outcomes = point_list.run_points(self.points, self.settings, strict=strict)
         return self
 
-    def states(self) -> dict[str, list[str]]:
-        """States of trials that count, by label of the point."""
-        found: dict[str, list[str]] = {}
-        for trial in self.store.trials():
-            found.setdefault(trial.user_attrs["rgbt.label"], []).append(trial.state.name)
-        return found
-
-    def numbers(self, state: str) -> list[int]:
-        return [trial.number for trial in self.store.trials() if trial.state.name == state]
+    def states(self) -> list[str]:
+        return [each.state for each in self.outcomes or ()]
 
 
-def memory() -> Any:
-    """A storage of its own, of one thread."""
-    return open_storage("sqlite://", Path("unused"))
-
-
-def store_on(
-    storage: Any, wanted: SweepSettings | None = None, kind: str = "list", **study: Any
-) -> TrialStore:
-    """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
-    objectives = (wanted or settings()).objectives
-    began = open_study("study", storage, objectives, {names.KIND: kind}, **study)
-    return TrialStore(began, storage)
-
-
-def silence(storage: Any, seconds: float = 2 * STALE_S) -> None:
-    """No trial was heard of for so long."""
-    change = f"UPDATE trial_heartbeats SET heartbeat = datetime('now', '-{seconds} seconds')"
-    with storage.engine.begin() as connection:
-        connection.execute(sqlalchemy.text(change))
-
-
-def list_desk(
-    runs_dir: Path,
-    given: Sequence[Point],
-    behaviour: Behaviour = succeed,
-    *,
-    storage: Any = None,
-    view: FakeView | None = None,
-    more: Any = None,
-    **changes: Any,
-) -> Desk:
-    """A driver of a list of points, which are planned."""
-    wanted, runs = settings(**changes), RunStore(runs_dir, NoTracking())
-    wished = PointList("study", "s", "list", tuple(given), runs, FakePlanner(), more)  # type: ignore[arg-type]
-    source = ListSource(wished, wanted)
-    source.store = store_on(memory() if storage is None else storage, wanted)
-    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
-    return Desk(driver, source.store, executor, runs, seen, [plan_of(point) for point in given])
-
-
-def search_desk(
-    runs_dir: Path,
-    behaviour: Behaviour = succeed,
-    *,
-    space: Mapping[str, Any] | None = None,
-    storage: Any = None,
-    view: FakeView | None = None,
-    planner: Any = None,
-    pruner: Any = None,
-    **changes: Any,
-) -> Desk:
+class SearchDesk(Desk):
     """A driver of a search over x in 0..1, or over `space`."""
-    wanted = settings(pruner=None if pruner is None else {"_target_": "given"}, **changes)
-    sampler = build_sampler(wanted.sampler)
-    storage = memory() if storage is None else storage
-    store = store_on(storage, wanted, "search", sampler=sampler, pruner=pruner)
-    runs = RunStore(runs_dir, NoTracking())
-    searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
-    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    planner = planner or FakePlanner()
-    source = SamplerSource((), searched, store, planner, wanted, seen.say)
-    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
-    return Desk(driver, store, executor, runs, seen)
 
+    def __init__(
+        self,
+        runs_dir: Path,
+        behaviour: Behaviour = succeed,
+        *,
+        space: Mapping[str, Any] | None = None,
+        storage: Any = None,
+        pruner: Any = None,
+        **others: Any,
+    ) -> None:
+        super().__init__(runs_dir, behaviour, pruner=pruner and {"_target_": "given"}, **others)
+        self.storage = storage or optuna.storages.InMemoryStorage()
+        both = {"sampler": build_sampler(self.settings.sampler), "pruner": pruner}
+        self.study = open_study("study", self.storage, self.settings.objectives, {}, **both)
+        searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
+        given = ((), searched, self.study, self.settings, self.view.say)
+        self.source = SearchSource(*given, self.planner)
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drivers that look again at once."""
-    monkeypatch.setattr(drivers, "POLL_S", 0.001)
-    monkeypatch.setattr(drivers, "CLAIM_S", 0.002)
+    def run(self) -> SearchDesk:
+        with driven_by(self.executor, self.view):
+            drivers.drive(self.view, self.source, self.runs, self.settings)  # type: ignore[arg-type]
+        return self
 
+    @property
+    def trials(self) -> list[Any]:
+        return self.study.get_trials(deepcopy=False)
 
-def until(condition: Callable[[], Any], what: str) -> Any:
-    """What `condition` answers once it is true; fails after `DEADLINE_S`."""
-    end = time.monotonic() + DEADLINE_S
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.01)
-    raise AssertionError(f"waited {DEADLINE_S:g} s in vain for {what}")
-
-
-def is_alive(pid: int) -> bool:
-    """Whether a process of this machine runs; a zombie does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
+    def states(self) -> list[str]:
+        return [trial.state.name for trial in self.trials]

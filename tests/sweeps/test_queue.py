@@ -24,15 +24,13 @@ from tests.sweeps.fakes import (
     Call,
     FakeExecutor,
     FakePlanner,
+    FakeView,
     Process,
+    driven_by,
     fail,
     only,
-    quick,
     succeed,
 )
-
-__all__ = ["quick"]
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEAD = "paper: my\nnumber: {0}\ncaption: rows\ndata: none\n"
 COLUMNS = "columns: [{name: acc, metric: pixel_accuracy}]\nrows:\n"
@@ -85,10 +83,8 @@ def run(
 ) -> tuple[int, list[str]]:
     """Exit code, and the experiments that were run, in their order."""
     chosen = Options(table=table, runs_dir=place / "runs", **options)
-    executor = FakeExecutor(place / "runs", behaviour)
     runs, planner = RunStore(place / "runs", NoTracking()), QuickPlanner()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drivers, "LocalExecutor", lambda workers: executor)
+    with driven_by(executor := FakeExecutor(behaviour), FakeView()):
         code = queues.run_queue(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
     return code, [words[0].removeprefix("+experiment=") for words in executor.started()]
 
@@ -140,6 +136,13 @@ def test_a_failed_run_does_not_end_the_queue(place: Path) -> None:
     assert (code, sorted(order)) == (1, ["baseline", "cmx", "crm", "mfnet", "rtfnet"])
     assert len(archived(place / "results")) == 4
     assert run(place, fail) == (1, []), "it is not repeated"
+
+
+def test_commands_are_in_the_order_of_the_queue(place: Path) -> None:
+    assert run(place, commands=place / "file") == (0, [])
+    lines = (place / "file").read_text().splitlines()
+    names = [line.partition("+experiment=")[2].split()[0] for line in lines]
+    assert names == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
 
 
 def test_dry_run_prints_the_order_with_minutes(

@@ -11,9 +11,9 @@ from rgbt.config.options import types_of
 from rgbt.runs.result import OWN
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import Options, entry, settings_of
-from sweeps.settings import SweepSettings
 from sweeps.run import point_list
 from sweeps.run.point_list import PointList
+from sweeps.settings import SweepSettings
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
 
@@ -124,6 +124,8 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
         ("table=my/small workers=0", "workers'"),
         ("table=my/small +experiment=crm", "experiment"),
         ("table=my/small camera@consistency.view.camera=synth", "rgbt consistency"),
+        ("table=my/small hydra/launcher=joblib", "hydra.sweeper.workers"),
+        ("table=my/small hydra.launcher.partition=gpu", "partition"),
         ("", "'table'"),
     ],
 )
@@ -143,9 +145,13 @@ def test_options_of_execution_are_sweep_settings() -> None:
         "gpus": (0, 1),
         "retry": "failed",
         "wait": False,
-        "storage": "postgresql://user@host/name",
+        "stop_jobs": True,
+        "commands": Path("file"),
         "timeout_minutes": 3.0,
         "trust": "my_lab",
     }
     assert set(types_of(Options)) & set(SweepSettings.__dataclass_fields__) == set(changes)
-    assert vars(settings_of(Options("my/small", **changes))).items() >= changes.items()
+    words = ("hydra/launcher=ray", "hydra.launcher.num_gpus=0.25")
+    found = settings_of(Options("my/small", **changes), words)
+    assert vars(found).items() >= {**changes, "commands": "file"}.items()
+    assert (found.launcher.name, found.launcher.options["num_gpus"]) == ("ray", 0.25)

@@ -10,22 +10,30 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from sweeps.settings import Objective, SweepSettings, read_settings
+from sweeps.settings import Launcher, Objective, SweepSettings, read_settings
 
 FILE = conf_dir() / "hydra" / "sweeper" / "study.yaml"
 
 
 def changed(**values: Any) -> SweepSettings:
     node = OmegaConf.load(FILE)
-    return read_settings(OmegaConf.create({**{str(key): node[key] for key in node}, **values}))
+    changed = OmegaConf.create({**{str(key): node[key] for key in node}, **values})
+    return read_settings(changed, Launcher("ray", {"num_gpus": 0.25}))
 
 
 def test_sweeper_file_holds_all_settings() -> None:
     keys = set(map(str, OmegaConf.load(FILE))) - {"_target_", "_recursive_"}
-    assert keys == {field.name for field in fields(SweepSettings)}
+    assert keys == {field.name for field in fields(SweepSettings)} - {"launcher"}
     settings = changed()
     assert settings.objectives == (Objective("val/mIoU", "maximize"),)
-    assert (settings.workers, settings.points, settings.pruner, settings.trust) == (1, (), None, "")
+    assert (settings.workers, settings.points, settings.pruner, settings.trust) == (
+        None,
+        (),
+        None,
+        "",
+    )
+    assert (settings.wait, settings.stop_jobs, settings.commands) == (True, False, None)
+    assert settings.launcher == Launcher("ray", {"num_gpus": 0.25})
 
 
 def test_read_settings_converts_and_resolves() -> None:

@@ -15,7 +15,8 @@ from optuna.trial import TrialState, create_trial
 
 from rgbt.tables import TextTable
 from sweeps import attributes, study
-from sweeps.study import StudyData, entry, importances, study_folder
+from sweeps.run.optuna_study import driving, storage_url, study_folder
+from sweeps.study import StudyData, entry, importances
 from tests.commands import Call, assert_one_sentence
 
 ALPHA = FloatDistribution(0, 1)
@@ -23,14 +24,13 @@ SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
 DIRECTIONS = {"val/mIoU": "maximize", "val/Var": "minimize", "up": "maximize", "down": "minimize"}
 
 
-def new_study(*metrics: str, kind: str = "search", **where: Any) -> optuna.Study:
+def new_study(*metrics: str, **where: Any) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     directions = [DIRECTIONS[metric] for metric in metrics]
     made = optuna.create_study(**{"study_name": "s", "directions": directions, **where})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # experimental
         made.set_metric_names(list(metrics))
-    made.set_user_attr(attributes.KIND, kind)
     return made
 
 
@@ -91,22 +91,15 @@ def test_pareto_front_of_five_points() -> None:
     assert [row[1:4] for row in grid.rows] == values
 
 
-def test_tables_of_list_keep_point_order_and_last_trials() -> None:
-    made = new_study("val/mIoU", kind="list")
-    add(made, [51.0], label="Ny/4 seed=1", key="k1", runs=["k1"])
-    add(made, state="FAIL", label="Ny/2 seed=1", key="k2", reason="exit code 1")
-    add(made, [52.0], label="Ny/2 seed=1", key="k2", runs=["k2"])
-    add(made, state="RUNNING", label="Ny seed=1", key="k3")
-    add(made, state="FAIL", label="x", key="k4", reason="by\nsignal | 9", runs=["r1", "r2"])
-    counts, points, failed = study.tables(StudyData.read(made))
-    assert counts.rows == (("5", "2", "0", "2", "1", "0"),)
-    assert points.header[:4] == ("trial", "point", "state", "val/mIoU")
-    assert [row[:4] for row in points.rows[:3]] == [
-        ("0", "Ny/4 seed=1", "complete", "51.00"),
-        ("2", "Ny/2 seed=1", "complete", "52.00"),
-        ("3", "Ny seed=1", "running", "-"),
-    ]
-    assert failed.rows == (("by signal | 9", "4", "x", "r1 r2"),)
+def test_tables_count_the_states_and_list_failures() -> None:
+    made = new_study("val/mIoU")
+    add(made, [51.0], runs=["k1"])
+    add(made, state="RUNNING")
+    add(made, state="FAIL", label="x", reason="by\nsignal | 9", runs=["r1", "r2"])
+    counts, best, failed = study.tables(StudyData.read(made))
+    assert counts.rows == (("3", "1", "0", "1", "1", "0"),)
+    assert [row[0] for row in best.rows] == ["0"]
+    assert failed.rows == (("by signal | 9", "2", "x", "r1 r2"),)
 
 
 def test_trials_csv_has_all_trials_with_full_numbers(tmp_path: Path) -> None:
@@ -155,21 +148,24 @@ def test_study_of_search_is_shown_and_written(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: str | None
 ) -> None:
     monkeypatch.setattr(study, "find_spec", lambda _: installed)
-    url = f"sqlite:///{tmp_path}/studies.db"
+    folder = study_folder(tmp_path, "search/grbm")
+    folder.mkdir(parents=True)
+    url = storage_url(None, tmp_path, "search/grbm")
     made = new_study("val/mIoU", study_name="search/grbm", storage=url)
     made.set_user_attr(attributes.COMMAND, "python -m rgbt.run -m storage=postgresql://u:pw@h/db")
     for alpha in (0.25, 0.75, 0.5):
         add(made, [50 + alpha], params={"masker.alpha": alpha}, runs=["key"])
     add(made, state="FAIL", reason="exit code 1: [Errno 28] disk full")
     made.ask()  # still running
-    code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
+    with driving(tmp_path, "search/grbm"):
+        code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
     assert (code, err) == (0, "")
-    folder = study_folder(tmp_path, "search/grbm")
     assert out.index("50.75") < out.index("50.50") < out.index("50.25")
     assert "[Errno 28] disk full" in out
     assert "Importances: they need 10 complete trials, and there are 3." in out
     assert (f"optuna-dashboard {url}" in out) == bool(installed)
-    assert {path.name for path in folder.iterdir()} == {"study.md", "trials.csv"}
+    found = {path.name for path in folder.iterdir()}
+    assert found == {"study.md", "trials.csv", "optuna.db", "lock"}
     text = (folder / "study.md").read_text()
     assert "postgresql://u:***@h/db" in text
     assert "| 50.75 |" in text
@@ -178,13 +174,17 @@ def test_study_of_search_is_shown_and_written(
 def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path) -> None:
     code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}")
     assert code == 2
-    assert_one_sentence(err, "studies.db")
+    assert_one_sentence(err, "studies")
     assert list(tmp_path.iterdir()) == []
-    new_study("up", study_name="search/grbm", storage=f"sqlite:///{tmp_path}/studies.db")
-    for words in (["name=search/grb"], []):
-        code, _, err = call(entry, *words, f"runs_dir={tmp_path}")
-        assert code == 2
-        assert_one_sentence(err, "search/grbm")
+    url = f"sqlite:///{tmp_path}/all.db"
+    study_folder(tmp_path, "search/grbm").mkdir(parents=True)
+    own = storage_url(None, tmp_path, "search/grbm")
+    for storage, words in ((own, []), (url, [f"storage={url}"])):
+        new_study("up", study_name="search/grbm", storage=storage)
+        for name in (["name=search/grb"], []):
+            code, _, err = call(entry, *name, *words, f"runs_dir={tmp_path}")
+            assert code == 2
+            assert_one_sentence(err, "search/grbm")
 
 
 def test_study_folders_are_safe_and_differ() -> None:

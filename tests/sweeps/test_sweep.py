@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import optuna
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import open_dict
+from optuna.trial import TrialState
 
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
@@ -21,13 +21,13 @@ from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.settings import Objective, SweepSettings
-from sweeps.space import parse_space
-from sweeps.sweep import Search, probe, search, sweep
-from sweeps.run import point_list
+from sweeps.run import executors, point_list
+from sweeps.run.optuna_study import driving, known_studies
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import open_run_store
-from sweeps.run.storage import open_storage
+from sweeps.settings import Launcher, Objective, SweepSettings
+from sweeps.space import parse_space
+from sweeps.sweep import Search, probe, search, sweep
 from tests.commands import SPLITS, short, words_of
 from tests.conftest import write_data
 from tests.sweeps.fakes import settings as plain_settings
@@ -80,7 +80,6 @@ def test_grid_is_all_combinations_with_parameters(calls: RecordedCalls, tmp_path
     ]
     assert wanted.points[3].params == {"masker.sigma_div": 2, "seed": 3}
     assert wanted.points[0].overrides[-3:] == ("+experiment=grbm", "masker.sigma_div=1", "seed=0")
-    assert wanted.kind == "grid"
     assert wanted.runs.fresh
     assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
 
@@ -91,7 +90,6 @@ def test_list_is_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path:
     call(tmp_path, "+experiment=grbm", points=points, params=params)
     (wanted,) = calls.lists
     assert {"model.weights=null", "trainer.max_steps=5"} <= set(wanted.points[0].overrides)
-    assert wanted.kind == "list"
     assert [point.label for point in wanted.points] == [
         *("seed=0 sigma_div=1 patch_size=8", "seed=0 sigma_div=4"),
         *("seed=1 sigma_div=1 patch_size=8", "seed=1 sigma_div=4"),
@@ -141,10 +139,33 @@ def test_failed_points_end_in_error_after_table(
     assert "oom" in capsys.readouterr().out
 
 
-def test_preview_of_grid_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_preview_and_commands_of_a_grid_run_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     call(tmp_path, *GRID, dry_run=True)
     assert list(tmp_path.iterdir()) == []
     assert "4 of 4 points" in capsys.readouterr().err
+    call(tmp_path, *GRID, commands=str(tmp_path / "all"))
+    assert [path.name for path in tmp_path.iterdir()] == ["all"]
+    assert (tmp_path / "all").read_text().count(" -m rgbt.run ") == 4
+
+
+def test_a_grid_that_another_process_drives_ends_quietly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with driving(tmp_path, "mine"):
+        call(tmp_path, *GRID, study="mine")
+    said = capsys.readouterr()
+    assert "study mine is driven by process" in said.err
+    assert not said.out
+
+
+def test_a_launcher_without_its_package_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(executors, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match="hydra/launcher=ray: it needs pip install"):
+        call(tmp_path, *GRID, "hydra/launcher=ray")
 
 
 def sigma(low: float, high: float) -> Any:
@@ -166,14 +187,11 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     states: list[str] = ["COMPLETE"]
 
     def drive(view: Any, source: Any, *rest: Any) -> None:
-        store = source.store
+        study = source._study
         for state in states:
-            trial = store.ask(None)
-            trial.suggest_float("masker.sigma_div", 1, 4)
-            if state == "COMPLETE":
-                store.complete(trial.number, [1.0], {names.RUNS: ["k"]})
-            else:
-                store.fail(trial.number, "no memory", {})
+            trial = study.ask(dict(source._space))
+            trial.set_user_attr(names.REASON, "no memory")
+            study.tell(trial, 1.0 if state == "COMPLETE" else None, TrialState[state])
 
     monkeypatch.setattr(sweeping, "drive", drive)
     monkeypatch.setattr(sweeping, "publish_study", lambda *_: None)
@@ -192,8 +210,7 @@ def test_search_creates_study_and_previews_it(
     assert list(tmp_path.iterdir()) == []
     assert "0 of 3 trials" in capsys.readouterr().out
     search(wanted, settings())
-    study = optuna.load_study(study_name="s", storage=open_storage(None, tmp_path))
-    assert study.user_attrs[names.KIND] == "search"
+    study = known_studies(None, tmp_path)["s"]
     assert study.user_attrs[names.COMMAND]
     search(wanted, settings(dry_run=True))
     assert "1 of 3 trials" in capsys.readouterr().out
@@ -213,6 +230,7 @@ def test_search_with_other_identity_is_refused(wanted: Search, ends: list[str]) 
         search(wanted, settings(objectives=(Objective("val/Var", "minimize"),)))
 
 
+FAR = ("ray", "submitit_slurm")
 TC, UP = (Objective(metric, "maximize") for metric in ("val/TC/aligned", "val/mIoU"))
 
 
@@ -223,6 +241,8 @@ TC, UP = (Objective(metric, "maximize") for metric in ("val/TC/aligned", "val/mI
         ({"sampler": {"_target_": "optuna.samplers.TPE"}}, "hydra.sweeper.sampler"),
         ({"objectives": (UP, UP), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
         ({"objectives": (TC,)}, "val/TC/aligned'.*consistency.splits"),
+        ({"commands": "file"}, "hydra.sweeper.commands is for grids"),
+        *(({"launcher": Launcher(name)}, f"{name} needs hydra.sweeper.workers") for name in FAR),
     ],
 )
 def test_search_invalid_settings_raise_before_study_exists(
@@ -237,6 +257,19 @@ def test_search_invalid_settings_raise_before_study_exists(
 def test_probe_range_outside_setting_raises(wanted: Search, low: float, high: float) -> None:
     with pytest.raises(InputError, match=r"'masker.sigma_div'"):
         probe(replace(wanted, space=sigma(low, high)), settings())
+
+
+def test_a_search_that_another_process_drives_ends_quietly(
+    wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with driving(tmp_path, "s"):
+        search(wanted, settings())
+    assert "study s is driven by process" in capsys.readouterr().err
+    assert known_studies(None, tmp_path) == {}
+    url = f"sqlite:///{tmp_path}/all.db"
+    for name in ("s", "t"):
+        search(replace(wanted, study=name), settings(storage=url))
+    assert sorted(known_studies(url, tmp_path)) == ["s", "t"]
 
 
 def test_search_without_finished_trial_raises(wanted: Search, ends: list[str]) -> None:

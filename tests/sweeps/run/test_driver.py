@@ -1,246 +1,255 @@
-"""A driver: claims, processes, ends, retries, interruptions."""
+"""A driver: what is submitted when, how points end, interruptions, jobs that go on without it."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import optuna
 import pytest
 
+from rgbt.checks import InputError, RunError
+from rgbt.files.atomic import holding
 from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
-from sweeps.settings import Objective
+from sweeps.point import Point
 from sweeps.run import driver as drivers
+from sweeps.run import running_point
+from sweeps.run.driver import work_of
+from sweeps.settings import Objective
 from tests.sweeps.fakes import (
     Call,
-    Desk,
     FakeView,
+    ListDesk,
     Process,
+    SearchDesk,
     fail,
     finish,
     hang,
     interrupt_when,
+    lasting,
     leave,
-    list_desk,
-    memory,
+    measure,
+    nth,
     only,
-    points,
-    quick,
+    plan_of,
     scored,
-    search_desk,
 )
 
-__all__ = ["quick"]
-pytestmark = pytest.mark.usefixtures("quick")
-
 UP = (Objective("val/mIoU", "maximize"),)
+RGB, RING = ("modality=rgb",), ("modality=thermal", "regions=ring9")
+PAIRS = tuple((f"frames={each}",) for each in ("aligned", "released", "next"))
 
 
-def trial(desk: Desk, number: int) -> Any:
-    return desk.store.study.get_trials(deepcopy=False)[number]
-
-
-def reason(desk: Desk, number: int) -> str:
-    return str(trial(desk, number).user_attrs[names.REASON])
-
-
-def test_driver_second_call_runs_nothing(tmp_path: Path) -> None:
-    storage = memory()
+def test_points_are_run_in_order_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
     most: list[int] = []
-    view = FakeView(lambda works: most.append(len(works)))
-    desk = list_desk(tmp_path, points(4), storage=storage, workers=2, view=view).run()
-    assert max(most) == 2, "no more processes than workers"
-    assert sorted(desk.executor.started()) == [(f"x={x}",) for x in range(4)]
-    assert desk.states() == {f"x={x}": ["COMPLETE"] for x in range(4)}
-    assert trial(desk, 0).values == [25.0]
-    assert trial(desk, 0).user_attrs[names.RESULTS]["test/Var"] == 9.0
-    assert trial(desk, 0).user_attrs[names.SECONDS] >= 0
-    assert [how for _, how, _ in desk.view.ends] == ["finished"] * 4
-    again = list_desk(tmp_path, points(4), storage=storage).run()
-    assert again.executor.calls == []
-    assert len(again.store.trials()) == 4
+    view = FakeView(lambda running: most.append(len(running)))
+    desk = ListDesk(tmp_path, 4, slots=2, view=view).run()
+    assert max(most) == 2
+    assert desk.executor.started() == [(f"x={x}",) for x in range(4)]
+    assert set(desk.states()) == {"finished"}
+    assert [how for _, how, _ in view.ends] == ["finished"] * 4
+    first = {"finished": 0, "running": 2, "failed": 0, "waiting": 2}
+    assert (view.counts[0], view.counts[-1]["finished"]) == (first, 4)
+    again = ListDesk(tmp_path, 4).run()
+    assert (again.executor.submits, again.states()) == ([], desk.states())
 
 
-def test_driver_finished_points_need_no_slot(tmp_path: Path) -> None:
-    done: list[int] = []
-    view = FakeView(lambda works: done.append(len(desk.numbers("COMPLETE"))))
-    desk = list_desk(tmp_path, points(5), view=view, workers=2)
-    for plan in desk.plans[1:]:
-        finish(tmp_path / plan.key)
-    desk.run()
-    assert desk.executor.started() == [("x=0",)]
-    assert done[0] == 4, "all four in the first round, while x=0 trains"
+def test_all_free_points_are_one_submission(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, 5, slots=9)
+    finish(tmp_path / desk.keys[0])
+    assert desk.run().executor.submits == [desk.keys[1:]]
 
 
-def test_driver_failed_points_keep_reason_until_retried(tmp_path: Path) -> None:
-    storage = memory()
-    behaviour = only("x=1", fail, only("x=2", leave(-9)))
-    desk = list_desk(tmp_path, points(4), behaviour, storage=storage).run()
-    ends = ["COMPLETE", "FAIL", "FAIL", "COMPLETE"]
-    assert desk.states() == {f"x={x}": [end] for x, end in enumerate(ends)}
-    assert reason(desk, 1) == "ValueError: a bad day"
-    assert "SIGKILL" in reason(desk, 2)
-    assert list_desk(tmp_path, points(4), storage=storage).run().executor.calls == []
-    again = list_desk(tmp_path, points(4), fail, storage=storage, retry="failed").run()
-    assert sorted(again.executor.started()) == [("x=1",), ("x=2",)], "forgiven once"
-    assert again.states()["x=1"] == ["FAIL", "FAIL"]
+def test_a_failed_point_does_not_stop_the_others(tmp_path: Path) -> None:
+    behaviour = only("x=0", fail, only("x=1", leave(-9)))
+    desk = ListDesk(tmp_path, 4, behaviour)
+    other = tmp_path / desk.keys[3]
+    finish(other, dataset="another")
+    assert desk.run().states() == ["failed", "failed", "finished", "failed"]
+    reasons = [each.reason for each in desk.outcomes or ()]
+    assert reasons[0] == "ValueError: a bad day"
+    assert "SIGKILL" in reasons[1]
+    assert "trained on other files" in reasons[3]
+    assert [how for how, _ in desk.view.said if how == "failed"] == ["failed"]
 
 
-@pytest.mark.parametrize("score", [None, float("inf")])
-def test_driver_score_that_is_no_number_fails(tmp_path: Path, score: float | None) -> None:
-    def no_score(call: Call) -> Process:
-        yield
-        finish(call.folder, test={"mIoU": score, "Var": 1.0})
-        return 0
+def test_a_job_gets_what_a_point_lacks(tmp_path: Path) -> None:
+    tags = {"rgbt.table/one": "row"}
+    words = ("dataset.root=/x", "y=1")
+    desk = ListDesk(tmp_path, [Point("p", words, {}, tags, (0, 1), (RGB, RING, *PAIRS))])
+    plan = plan_of(desk.given[0])
+    done, new = (tmp_path / run.key for run in plan.runs)
+    finish(done)
+    measure(done, RGB)
+    work = work_of(plan, desk.runs, "my_lab")
+    own = ("trust=my_lab", "dataset.root=/x")
+    more = [("rgbt.evaluate", *RING), *(("rgbt.consistency", f"frames={each}") for each in VIEWS)]
 
-    desk = list_desk(tmp_path, points(1), no_score).run()
-    assert desk.states() == {"x=0": ["FAIL"]}
-    assert "no test/mIoU that is a number" in reason(desk, 0)
+    def measured(folder: Path, *steps: tuple[str, ...]) -> list[tuple[str, ...]]:
+        return [(module, f"run={folder}", *rest, *own) for module, *rest in steps]
+
+    assert [step.words for step in work.steps] == [
+        *measured(done, *more),
+        ("rgbt.run", *words, "seed=1"),
+        *measured(new, ("rgbt.evaluate", *RGB), *more),
+    ]
+    assert [step.folder for step in work.steps] == [done] * 3 + [new] * 5
+    assert json.loads(work.environment[TAGS]) == tags
+    # Threads are a setting of the run: two jobs at a time give the bits of one.
+    assert "OMP_NUM_THREADS" not in work.environment
+    assert work.log == tmp_path / ".logs" / f"{plan.key}.log"
 
 
-@pytest.mark.slow
-def test_driver_timeout_starts_next_trial(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, points(2), only("x=0", hang), timeout_minutes=0.02).run()
-    assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
-    assert "timeout_minutes" in reason(desk, 0)
-    assert desk.executor.calls[0].stops == 1
+VIEWS = ("virtual", "next")
+"""Both protocols of virtual views are one command."""
 
 
-def test_driver_gives_processes_tags_gpu_and_trust(tmp_path: Path) -> None:
-    ring = ("regions=ring9",)
-    tagged = points(2, tags={"rgbt.table/one": "row"}, evaluations=(ring,))
-    desk = list_desk(tmp_path, tagged, workers=2, gpus=(3, 5), trust="my_lab").run()
-    trusting = ["trust=my_lab" in call.words for call in desk.executor.calls]
-    assert trusting == [False, False, True, True]
-    environments = [call.environment for call in desk.executor.calls[:2]]
-    assert [env["CUDA_VISIBLE_DEVICES"] for env in environments] == ["3", "5"]
-    # Threads are a setting of the run: two workers give the bits of one.
-    assert not any("OMP_NUM_THREADS" in env for env in environments)
-    assert json.loads(environments[0][TAGS])["rgbt.table/one"] == "row"
+def test_evaluations_are_steps_of_the_job(tmp_path: Path) -> None:
+    given = [Point("p", ("x=1",), evaluations=(RGB, RING))]
+    desk = ListDesk(tmp_path, given, only("modality=rgb", fail)).run()
+    assert [call.module for call in desk.executor.calls] == ["rgbt.run", "rgbt.evaluate"]
+    assert (desk.states(), len(desk.executor.submits)) == (["failed"], 1)
 
 
 @pytest.mark.parametrize(("cores", "fitting"), [(6, None), (5, 2), (3, 1)])
-def test_driver_more_threads_than_cores_are_reported_once(
+def test_more_threads_than_cores_are_reported_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int, fitting: int | None
 ) -> None:
     """Three runs at a time, with two threads each; the second or the third one is too many."""
     monkeypatch.setattr(drivers, "usable_cores", lambda: cores)
-    desk = list_desk(tmp_path, points(6), scored(0.5), workers=3).run()
-    notes = [text for how, text in desk.view.said if how == "note"]
+    desk = ListDesk(tmp_path, 6, scored(0.5), slots=3)
+    monkeypatch.setattr(drivers, "LocalExecutor", type(desk.executor))
+    notes = [text for how, text in desk.run().view.said if how == "note"]
     assert len(notes) == (fitting is not None)
     for note in notes:
         assert f"with trainer.threads=2 share {cores} cores" in note
         assert f"more than workers={fitting} gain" in note
 
 
-def test_driver_sends_heartbeats_of_running_trials(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_point_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = [0.0]
+
+    def now() -> float:
+        seconds[0] += 1
+        return seconds[0]
+
+    monkeypatch.setattr(running_point, "time", SimpleNamespace(monotonic=now))
+    desk = ListDesk(tmp_path, 2, only("x=0", hang), timeout_minutes=1).run()
+    assert desk.states() == ["failed", "finished"]
+    assert "timeout_minutes" in desk.view.ends[0][2]
+    assert desk.executor.stopped() == ["0"]
+    # Jobs that wait for their turn have no limit.
+    cluster = lasting(hang)
+    cluster.is_full = True
+    looks = iter([False] * 100 + [True])
+    view = interrupt_when(lambda _: [now(), next(looks)][1])
+    with pytest.raises(KeyboardInterrupt):
+        ListDesk(tmp_path / "b", 1, executor=cluster, view=view, timeout_minutes=1).run()
+    assert cluster.stopped() == []
+
+
+@pytest.mark.parametrize(
+    ("is_lasting", "stop_jobs", "stopped"),
+    [(False, False, ["0", "1"]), (True, False, []), (True, True, ["0", "1"])],
+)
+def test_ctrl_c_stops_jobs_that_would_end_with_the_command(
+    tmp_path: Path, is_lasting: bool, stop_jobs: bool, stopped: list[str]
 ) -> None:
-    monkeypatch.setattr(drivers, "HEARTBEAT_S", 0.0)
-    desk = list_desk(tmp_path, points(1), scored(*[0.5] * 5))
-    sent: list[int] = []
-    monkeypatch.setattr(desk.store, "send_heartbeats", sent.extend)
-    desk.run()
-    assert sent.count(0) >= 5
-
-
-def test_driver_with_wait_stays_for_other_drivers(tmp_path: Path) -> None:
-    storage = memory()
-    other = list_desk(tmp_path, points(2), storage=storage)
-    task = other.source.next()
-    rounds: list[int] = []
-
-    def look(works: Any) -> None:
-        rounds.append(len(works))
-        if len(rounds) == 30:
-            finish(tmp_path / other.plans[0].key)
-            other.store.complete(task.number, [1.0], {})
-
-    desk = list_desk(tmp_path, points(2), storage=storage, wait=True, view=FakeView(look)).run()
-    assert len(rounds) >= 30
-    assert desk.executor.started() == [("x=1",)]
-    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["COMPLETE"]}
-
-
-def test_driver_ctrl_c_releases_trials(tmp_path: Path) -> None:
-    storage = memory()
-    view = interrupt_when(lambda works: len(works) == 2)
-    desk = list_desk(tmp_path, points(3), hang, storage=storage, view=view, workers=2)
+    executor, view = lasting(scored(0.4, 0.5), 2), interrupt_when(bool)
+    executor.is_lasting = is_lasting
     with pytest.raises(KeyboardInterrupt):
+        ListDesk(tmp_path, 3, executor=executor, view=view, stop_jobs=stop_jobs).run()
+    assert executor.stopped() == stopped
+    assert [job for job, found in executor.jobs.items() if found.end] == stopped
+    again = ListDesk(tmp_path, 3, executor=executor).run()
+    assert set(again.states()) == {"finished"}
+    assert len(executor.jobs) == 3 + len(stopped)
+
+
+def test_without_wait_a_call_submits_and_the_next_records(tmp_path: Path) -> None:
+    cluster = lasting(slots=3)
+    cluster.is_full = True
+    desk = ListDesk(tmp_path, 4, executor=cluster, wait=False).run()
+    assert cluster.submits == [desk.keys[:3]]
+    assert desk.states() == ["running"] * 3 + ["waiting"]
+    assert [how for how, _ in desk.view.said] == ["queued"] * 3
+    assert "job 2" in desk.view.said[2][1]
+    cluster.is_full = False
+    while cluster.jobs["0"].look() == "running":
+        pass
+    again = ListDesk(tmp_path, 4, executor=cluster, wait=False).run()
+    assert again.states()[0] == "finished"
+    assert len(cluster.jobs) == 4, "points that have a job keep it"
+    last = ListDesk(tmp_path, 4, executor=cluster).run()
+    assert set(last.states()) == {"finished"}
+    assert len(cluster.calls) == 4
+
+
+def test_runs_of_this_machine_are_waited_for(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, 1, wait=False)
+    with pytest.raises(InputError, match=r"wait=false: .*SLURM"):
         desk.run()
-    assert [call.stops for call in desk.executor.calls] == [1, 1]
-    assert all(job.poll() is not None for job in desk.executor.jobs)
-    assert desk.store.trials() == []
-    again = list_desk(tmp_path, points(3), storage=storage).run()
-    assert again.states() == {f"x={x}": ["COMPLETE"] for x in range(3)}
-
-    storage = memory()
-    desk = search_desk(tmp_path, hang, storage=storage, view=interrupt_when(bool), trials=2)
-    with pytest.raises(KeyboardInterrupt):
-        desk.run()
-    assert desk.numbers("WAITING") == [1]
-    again = search_desk(tmp_path, storage=storage, trials=2).run()
-    assert again.executor.started()[0] == desk.executor.started()[0]
-    assert len(again.numbers("COMPLETE")) == len(again.store.trials()) == 2
+    assert desk.executor.submits == []
 
 
-def test_driver_process_that_cannot_start_costs_one_trial(tmp_path: Path) -> None:
-    def full(call: Call) -> Process:
-        raise OSError(28, "No space left on device")
+def test_run_of_another_process_is_left_in_place(tmp_path: Path) -> None:
+    """With fresh=true, a finished run of other code is moved away, but not while it is held."""
+    desk = ListDesk(tmp_path, 1)
+    desk.runs.fresh = True
+    folder = tmp_path / desk.keys[0]
+    finish(folder).add_provenance({"code": "0" * 64, "diff": ""})
+    with holding(folder / "lock"):
+        work_of(plan_of(desk.given[0]), desk.runs, "")
+        assert (folder / "result.json").exists()
+    for calls in (1, 0):
+        again = ListDesk(tmp_path, 1)
+        again.runs.fresh = True
+        assert len(again.run().executor.calls) == calls
+    assert [path.name for path in (tmp_path / "replaced").iterdir()] == [f"{folder.name}-1"]
 
-    desk = list_desk(tmp_path, points(2), only("x=0", full)).run()
-    assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
 
-
-def test_driver_prunes_hopeless_trial(tmp_path: Path) -> None:
+def test_a_hopeless_trial_is_pruned(tmp_path: Path) -> None:
     good, bad = scored(0.5, 0.75, val=0.75), scored(0.5, 0.1, end=hang)
-
-    def described(call: Call) -> Process:
-        return (yield from (bad if len(desk.executor.calls) == 2 else good)(call))
-
     pruner = optuna.pruners.ThresholdPruner(lower=20.0)
-    desk = search_desk(tmp_path, described, pruner=pruner, objectives=UP, trials=3)
-    desk.run()
-    assert [each.state.name for each in desk.store.trials()] == ["COMPLETE", "PRUNED", "COMPLETE"]
-    assert trial(desk, 1).intermediate_values == {2: 50.0, 4: 10.0}
-    assert reason(desk, 1) == "pruned at step 4"
-    assert trial(desk, 0).values == [75.0]
-    assert [call.stops for call in desk.executor.calls] == [0, 1, 0]
+    behaviour = nth(good, bad, good)
+    desk = SearchDesk(tmp_path, behaviour, pruner=pruner, objectives=UP, trials=3).run()
+    assert desk.states() == ["COMPLETE", "PRUNED", "COMPLETE"]
+    assert desk.trials[1].intermediate_values == {2: 50.0, 4: 10.0}
+    assert desk.trials[1].user_attrs[names.REASON] == "pruned at step 4"
+    assert desk.trials[0].values == [75.0]
+    assert desk.executor.stopped() == ["1"]
     assert ("pruned", "pruned at step 4") in [end[1:] for end in desk.view.ends]
 
 
-def test_driver_replicates_average_and_report_first(tmp_path: Path) -> None:
+def test_replicates_are_averaged_and_the_first_is_reported(tmp_path: Path) -> None:
     values = {"seed=0": 0.5, "seed=1": 0.25, "seed=2": 0.75}
 
     def by_seed(call: Call) -> Process:
         score = values[call.words[-1]]
         return (yield from scored(score, val=score)(call))
 
-    desk = search_desk(tmp_path, by_seed, objectives=UP, trials=1, replicates=3).run()
-    (one,) = desk.store.trials()
-    assert one.values == [50.0]
-    assert one.intermediate_values == {2: 50.0}
+    desk = SearchDesk(tmp_path, by_seed, objectives=UP, trials=1, replicates=3).run()
+    (trial,) = desk.trials
+    assert (trial.values, trial.intermediate_values) == ([50.0], {2: 50.0})
     assert [call.words[-1] for call in desk.executor.calls] == list(values)
-    assert len(one.user_attrs[names.RUNS]) == 3
+    assert len(trial.user_attrs[names.RUNS]) == 3
 
 
-def test_driver_waits_for_unreachable_storage(
+def test_a_storage_that_is_away_ends_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drivers, "PAUSE_S", 0.0)
-    desk = list_desk(tmp_path, points(2))
-    complete = desk.store.complete
-    tries: list[int] = []
+    desk = SearchDesk(tmp_path, objectives=UP, trials=1)
+    tell = desk.study.tell
 
-    def away(*arguments: Any) -> None:
-        tries.append(1)
-        if len(tries) < 3:
-            raise optuna.exceptions.StorageInternalError("no route to host")
-        complete(*arguments)
+    def away(*_: Any, **__: Any) -> None:
+        raise optuna.exceptions.StorageInternalError("no route to host\nmore")
 
-    monkeypatch.setattr(desk.store, "complete", away)
-    desk.run()
-    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["COMPLETE"]}
-    assert len(desk.executor.calls) == 2
+    monkeypatch.setattr(desk.study, "tell", away)
+    with pytest.raises(RunError, match="storage: no route to host; rerun the command"):
+        desk.run()
+    monkeypatch.setattr(desk.study, "tell", tell)
+    again = SearchDesk(tmp_path, storage=desk.storage, objectives=UP, trials=1).run()
+    assert (again.states(), again.executor.calls) == (["COMPLETE"], [])

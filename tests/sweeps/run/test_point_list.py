@@ -1,7 +1,10 @@
-"""Lists of points: planned once while the first runs train, claimed in order, each run once."""
+"""Lists of points: planned once, each run once, what is remembered, and their commands."""
 
 from __future__ import annotations
 
+import json
+import shlex
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,82 +14,63 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.files.atomic import holding
 from rgbt.files.plain_files import write_json
-from rgbt.runs.naming import VARIED
+from rgbt.runs.naming import TAGS, VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.run import driver as drivers
+from sweeps.run.optuna_study import study_folder
 from sweeps.run.planner import PlannedPoint
 from sweeps.run.point_list import (
-    ListSource,
-    PointList,
+    commands_line,
     estimated_seconds,
     finished_runs,
-    is_evaluated,
     other_code_line,
     preview_points,
-    run_points,
 )
 from sweeps.run.run_store import RunStore
-from sweeps.run.running_trial import ClaimedTrial
 from tests.sweeps.fakes import (
-    Desk,
-    FakeExecutor,
     FakePlanner,
+    ListDesk,
+    fail,
     finish,
-    list_desk,
+    leave,
     measure,
-    memory,
+    only,
     plan_of,
     points,
-    quick,
-    settings,
 )
 
-__all__ = ["quick"]
+
+def named(*words: str, **more: Any) -> list[Point]:
+    return [Point(word, (word,), tags={"t": "grid"}, **more) for word in words]
 
 
-@pytest.fixture
-def executor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: None) -> FakeExecutor:
-    """Runs the processes of `run_points`."""
-    del quick
-    made = FakeExecutor(tmp_path)
-    monkeypatch.setattr(drivers, "LocalExecutor", lambda workers: made)
-    return made
+def previewed(desk: ListDesk) -> list[str]:
+    return [each.state for each in preview_points(desk.points, desk.settings)]
 
 
-def a_list(runs: Path, *words: str, more: Any = None) -> PointList:
-    planner: Any = FakePlanner()
-    given = tuple(Point(word, (word,), tags={"t": "grid"}) for word in words)
-    return PointList("s", "s", "grid", given, RunStore(runs, NoTracking()), planner, more)
-
-
-def test_run_points_strict_with_wrong_point_starts_nothing(
-    tmp_path: Path, executor: FakeExecutor
-) -> None:
+def test_a_wrong_point_of_a_strict_list_starts_nothing(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, named("x=0", "wrong"))
     with pytest.raises(InputError, match="wrong: wrong=1"):
-        run_points(a_list(tmp_path, "x=0", "wrong"), settings(), strict=True)
-    assert executor.calls == []
-    assert list(tmp_path.iterdir()) == []
+        desk.run(strict=True)
+    assert (desk.executor.submits, list(tmp_path.glob("*/*.json"))) == ([], [])
 
 
-def test_wrong_points_fail_unless_all_are_wrong(tmp_path: Path, executor: FakeExecutor) -> None:
+def test_wrong_points_fail_unless_all_are_wrong(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^wrong=1 is no key"):
-        preview_points(a_list(tmp_path, "wrong", "wrong"), settings())
-    previews = preview_points(a_list(tmp_path, "wrong", "x=1"), settings())
-    assert [outcome.state for outcome in previews] == ["failed", "waiting"]
+        previewed(ListDesk(tmp_path, named("wrong", "wrong")))
+    desk = ListDesk(tmp_path, named("x=0", "wrong", "x=1"))
+    assert previewed(desk) == ["waiting", "failed", "waiting"]
     assert list(tmp_path.iterdir()) == []
-    outcomes = run_points(a_list(tmp_path, "x=0", "wrong", "x=1"), settings())
-    assert [each.state for each in outcomes] == ["finished", "failed", "finished"]
-    assert len(executor.calls) == 2
+    assert desk.run().states() == ["finished", "failed", "finished"]
 
 
 @pytest.mark.parametrize(("trust", "is_refused"), [("", True), ("my_lab", False)])
 def test_untrusted_class_is_refused_before_training(
-    tmp_path: Path, trust: str, is_refused: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trust: str, is_refused: bool
 ) -> None:
     class OwnLoss(FakePlanner):
         def plan(self, point: Point) -> PlannedPoint:
@@ -96,26 +80,12 @@ def test_untrusted_class_is_refused_before_training(
             return replace(planned, runs=tuple(runs))
 
     (tmp_path / "my_lab.py").write_text("class Loss: ...\n")
-    given = (Point("a", ("x=1",)), Point("b", ("x=2",), evaluations=(("modality=rgb",),)))
-    wanted = replace(a_list(tmp_path), points=given, planner=OwnLoss())  # type: ignore[arg-type]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(tmp_path))
-        source = ListSource(wanted, settings(trust=trust))
-    states = {each.point.label: each for each in source.outcomes(preview=True)}
-    assert states["a"].state == "waiting", "nothing opens its run"
-    assert ("my_lab.Loss" in states["b"].reason) == is_refused
-
-
-def test_waits_for_the_second_trial_of_a_killed_driver(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, points(1))
-    desk.run()
-    assert desk.source.is_exhausted(wait=True)
-    second = desk.store.claim(desk.plans[0].attributes, replaced=[0])
-    assert second == 1, "as if it had been killed before it compared"
-    assert not desk.source.is_exhausted(wait=True)
-    assert desk.source.is_exhausted(wait=False)
-    desk.store.release(second)
-    assert desk.source.is_exhausted(wait=True)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    given = [*named("x=1"), *named("x=2", evaluations=(("modality=rgb",),))]
+    desk = ListDesk(tmp_path, given, planner=OwnLoss(), trust=trust)
+    first, second = preview_points(desk.points, desk.settings)
+    assert first.state == "waiting", "nothing opens its run"
+    assert ("my_lab.Loss" in second.reason) == is_refused
 
 
 def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
@@ -123,55 +93,68 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
         def plan(self, point: Point) -> PlannedPoint:
             return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
 
-    rows = tuple(Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0"))
-    wanted = replace(a_list(tmp_path), points=rows, planner=SameRun())  # type: ignore[arg-type]
-    source = ListSource(wanted, settings())
-    found = source.outcomes(preview=True)
+    rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
+    desk = ListDesk(tmp_path, rows, planner=SameRun()).run()
     tags = {"table": "1 | 1.0", VARIED: "x"}
-    assert [each.point.tags for each in found] == [tags, tags]
+    assert [each.point.tags for each in desk.outcomes or ()] == [tags, tags]
+    assert (desk.states(), len(desk.executor.calls)) == (["finished"] * 2, 1)
+    assert desk.view.counts[-1]["finished"] == 1
 
 
-def taken(desk: Desk) -> ClaimedTrial:
-    task: ClaimedTrial | None = desk.source.next()
-    assert task is not None
-    return task
+def test_a_second_driver_says_who_drives_and_runs_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = study_folder(tmp_path, "study")
+    folder.mkdir(parents=True)
+    with holding(folder / "lock"):
+        desk = ListDesk(tmp_path, 1).run()
+        assert (desk.outcomes, desk.executor.submits) == (None, [])
+        assert "study study is driven by process" in capsys.readouterr().err
+        assert ListDesk(tmp_path, 1, study="other").run().states() == ["finished"]
+    assert desk.run().states() == ["finished"]
 
 
-def done(desk: Desk, task: ClaimedTrial) -> None:
-    """The task's runs are finished, and the study knows."""
-    for run in task.plan.runs:
-        finish(desk.runs.runs_dir / run.key)
-    desk.store.complete(task.number, [25.0], {names.RESULTS: {"test/mIoU": 25.0}})
+def test_two_studies_share_their_runs_and_tags(tmp_path: Path) -> None:
+    for study, calls in (("one", 2), ("two", 0)):
+        given = points(2, tags={f"rgbt.study/{study}": "grid"})
+        desk = ListDesk(tmp_path, given, study=study).run()
+        assert len(desk.executor.calls) == calls
+    tags = RunResult(tmp_path / desk.keys[0]).tags
+    assert {name for name in tags if name.startswith("rgbt.study/")} == {
+        *("rgbt.study/one", "rgbt.study/two"),
+    }
 
 
-def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, points(2))
-    assert [taken(desk).plan.point.label for _ in range(2)] == ["x=0", "x=1"]
-    assert desk.source.next() is None
-    trial = desk.store.trials()[1]
-    assert trial.user_attrs[names.LABEL] == "x=1"
-    assert trial.user_attrs[names.OVERRIDES] == ["x=1"]
-    assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
+def test_a_failed_point_keeps_its_reason_until_it_is_retried(tmp_path: Path) -> None:
+    behaviour = only("x=0", fail, only("x=1", leave(143), only("x=2", leave(-9))))
+    first = ListDesk(tmp_path, 4, behaviour).run()
+    assert first.states() == ["failed"] * 3 + ["finished"]
+    # Whom somebody has stopped, goes on.
+    again = ListDesk(tmp_path, 4).run()
+    assert again.executor.started() == [("x=1",), ("x=2",)]
+    assert (again.outcomes or [])[0].reason == "ValueError: a bad day"
+    assert again.view.counts[-1]["failed"] == 1
+    assert previewed(again)[0] == "failed"
+    retried = ListDesk(tmp_path, 4, fail, retry="failed").run()
+    assert retried.executor.started() == [("x=0",)], "once"
+    finish(tmp_path / first.keys[0])  # by hand
+    assert ListDesk(tmp_path, 4).run().states()[0] == "finished"
 
 
 def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
-    storage = memory()
-    before = list_desk(tmp_path, points(1), storage=storage)
-    done(before, taken(before))
-    assert before.source.next() is None
-    (tmp_path / before.plans[0].key / "result.json").unlink()
-    desk = list_desk(tmp_path, points(1), storage=storage)
-    assert desk.source.states() == ["waiting"]
-    assert taken(desk).number == 1
+    desk = ListDesk(tmp_path, 2).run()
+    (tmp_path / desk.keys[1] / "result.json").unlink()
+    again = ListDesk(tmp_path, 2)
+    assert previewed(again) == ["finished", "waiting"]
+    assert again.run().executor.started() == [("x=1",)]
 
 
-def test_failed_point_that_was_run_by_hand_is_finished(tmp_path: Path) -> None:
-    storage = memory()
-    before = list_desk(tmp_path, points(1), storage=storage)
-    before.store.fail(taken(before).number, "a bad day", {})
-    assert before.source.states() == ["failed"]
-    finish(tmp_path / before.plans[0].key)
-    assert list_desk(tmp_path, points(1), storage=storage).source.states() == ["finished"]
+def test_a_preview_shows_runs_that_somebody_trains(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, 2)
+    folder = tmp_path / desk.keys[0]
+    folder.mkdir()
+    with holding(folder / "lock"):
+        assert previewed(desk) == ["running", "waiting"]
 
 
 def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
@@ -185,9 +168,9 @@ def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
     assert [found.key for found in both] == [run.key for run in plan.runs]
     for found in both:
         for words in (ring, rgb):
-            assert not is_evaluated(plan, both)
+            assert not plan.is_evaluated(both)
             measure(found.folder, words)
-    assert is_evaluated(plan, both)
+    assert plan.is_evaluated(both)
     finish(tmp_path / plan.runs[0].key, dataset="another")
     assert finished_runs(plan, runs) == ()
 
@@ -203,14 +186,56 @@ def growing(last: int) -> Callable[[Sequence[Outcome]], list[Point]]:
     return more
 
 
-def test_run_points_resumed_continues_behind_the_added_points(
-    tmp_path: Path, executor: FakeExecutor
+def test_a_resumed_list_continues_behind_the_added_points(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, 1, more=growing(2)).run()
+    assert [each.point.label for each in desk.outcomes or ()] == [f"x={x}" for x in range(3)]
+    again = ListDesk(tmp_path, 1, more=growing(4)).run()
+    assert again.states() == ["finished"] * 5
+    assert again.executor.started() == [("x=3",), ("x=4",)]
+
+
+def test_the_point_of_the_highest_rank_is_next(tmp_path: Path) -> None:
+    ranks = {"x=0": 1.0, "x=1": 3.0, "x=2": 2.0}
+
+    def more(outcomes: Sequence[Outcome]) -> list[Point]:
+        if outcomes[1].state == "finished":
+            ranks["x=0"] = 9.0
+        return []
+
+    desk = ListDesk(tmp_path, 3, more=more, rank=lambda point: ranks[point.label]).run()
+    assert desk.executor.started() == [("x=1",), ("x=0",), ("x=2",)]
+
+
+FAKE_RUN = f"""
+import json, os, sys
+with open("said", "a") as file:
+    print(json.dumps([sys.argv[1:], json.loads(os.environ["{TAGS}"])]), file=file)
+"""
+
+
+def test_commands_are_a_line_of_shell_for_every_point_that_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    outcomes = run_points(a_list(tmp_path, "x=0", more=growing(2)), settings())
-    assert [outcome.point.label for outcome in outcomes] == [f"x={x}" for x in range(3)]
-    again = run_points(a_list(tmp_path, "x=0", more=growing(4)), settings())
-    assert [outcome.state for outcome in again] == ["finished"] * 5
-    assert executor.started() == [(f"x={x}",) for x in range(5)], "nothing is run twice"
+    monkeypatch.chdir(tmp_path)
+    Path("rgbt").mkdir()
+    for name in ("__init__", "run", "evaluate"):
+        Path(f"rgbt/{name}.py").write_text(FAKE_RUN if name != "__init__" else "")
+    tags, rgb = {"t": "a 'b' $HOME"}, ("modality=rgb",)
+    words = ("x=[1, 2]", 'name=it\'s; a $(b) "c"')
+    given = [Point("p", words, {}, tags, (), (rgb,)), *named("x=1", "x=2", "x=3", "x=1")]
+    desk = ListDesk(tmp_path / "runs", given, commands=str(tmp_path / "all.txt"))
+    finish(desk.runs.runs_dir / desk.keys[2])
+    before = sorted(desk.runs.runs_dir.rglob("*"))
+    assert commands_line(desk.points, desk.settings).startswith("3 commands in ")
+    assert sorted(desk.runs.runs_dir.rglob("*")) == before, "nothing is written there"
+    lines = Path("all.txt").read_text().splitlines()
+    assert ["x=1" in lines[1], "x=3" in lines[2], len(lines)] == [True, True, 3]
+    assert shlex.split(lines[0]).count("&&") == 1
+    subprocess.run(["sh", "-c", lines[0]], check=True)
+    said = [json.loads(line) for line in Path("said").read_text().splitlines()]
+    folder = desk.runs.runs_dir / plan_of(given[0]).runs[0].key
+    assert [arguments for arguments, _ in said] == [[*words], [f"run={folder}", *rgb]]
+    assert all(found["t"] == tags["t"] for _, found in said)
 
 
 def test_estimated_seconds_is_median_of_untrained_over_workers(tmp_path: Path) -> None:

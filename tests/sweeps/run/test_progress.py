@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -16,15 +17,16 @@ from sweeps.run.progress import ProgressView, duration
 
 Make = Callable[[bool], io.StringIO]
 LABEL = "files=[/data/a] [red]not a colour[/red]"
-TRIAL: Any = SimpleNamespace(
-    score=0.4567,
-    done_share=0.5,
-    seconds=100.0,
-    status="training",
-    number=0,
+PLAN = SimpleNamespace(point=Point(LABEL, ()))
+RUNNING: Any = SimpleNamespace(
+    task=SimpleNamespace(plan=PLAN),
     log="runs/.logs/k.log",
-    plan=SimpleNamespace(point=Point(LABEL, ())),
+    is_started=True,
+    **{"score": 0.4567, "step": 50, "steps": 100, "seconds": 100.0, "seconds_left": 1500.0},
 )
+QUEUED: Any = SimpleNamespace(**{**vars(RUNNING), "is_started": False, "step": 0})
+COUNTS = Counter(finished=1, failed=1, running=2, waiting=4)
+LINE = f"  {LABEL}  step 50 of 100  val mIoU 45.67  25 min left"
 
 
 @pytest.fixture
@@ -38,38 +40,45 @@ def console(monkeypatch: pytest.MonkeyPatch) -> Make:
     return make
 
 
-def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
-    text = console(False)
-    view = ProgressView("table", 1, lambda: (0, 3))
+def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
+    console: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, minutes = console(False), [0.0]
+    clock = SimpleNamespace(monotonic=lambda: 60 * minutes[0], strftime=lambda _: "12:00:00")
+    monkeypatch.setattr(progress, "time", clock)
+    view = ProgressView("table")
     with view:
-        view.say("started", TRIAL.plan.point.label)
-        view.update([TRIAL])
-        view.ended(TRIAL, "finished", "")
-        view.ended(TRIAL, "failed", "a bad day")
-        view.say("failed", "p: x does not fit.")
-    assert [line[9:] for line in text.getvalue().splitlines()] == [
+        view.say("started", LABEL)
+        for now in (0.5, 1.1, 1.5):
+            minutes[0] = now
+            view.update([RUNNING, QUEUED], COUNTS)
+        view.ended(RUNNING, "finished", "")
+        view.ended(RUNNING, "failed", "a bad day")
+    assert [line[9:].rstrip() for line in text.getvalue().splitlines()] == [
         f"started  {LABEL}",
-        f"finished {LABEL}  100 s  val mIoU 45.67",
-        f"failed   {LABEL}  100 s  val mIoU 45.67: a bad day; see runs/.logs/k.log",
-        "failed   p: x does not fit.",
+        "state    table: 1 finished, 1 failed, 1 running, 4 waiting, 1 queued",
+        f"         {LINE}",
+        f"finished {LABEL}  2 min  val mIoU 45.67",
+        f"failed   {LABEL}  2 min  val mIoU 45.67: a bad day; see runs/.logs/k.log",
     ]
 
 
-def test_progress_in_terminal_draws_bars_and_prints_failures(console: Make) -> None:
+def test_a_terminal_has_bars_and_lines_of_failures(console: Make) -> None:
     text = console(True)
-    view = ProgressView("table", 2, lambda: (1, 4))
+    view = ProgressView("table")
     with view:
-        view.say("started", TRIAL.plan.point.label)
-        view.ended(TRIAL, "finished", "")
-        view.ended(TRIAL, "failed", "a bad day")
-        view.update([TRIAL])
+        for word in ("queued", "started"):
+            view.say(word, LABEL)
+        view.ended(RUNNING, "finished", "")
+        view.ended(RUNNING, "failed", "a bad day")
+        view.update([RUNNING, QUEUED], COUNTS)
         probe = Console(file=io.StringIO(), width=160)
         probe.print(view._bars.get_renderable())
         seen = probe.file.getvalue()  # type: ignore[attr-defined]
-        parts = ("table, 2 at a time, 1 failed", "1/4", LABEL, "training  val mIoU 45.67  50%")
-        assert all(part in seen for part in parts)
-    assert f"failed   {LABEL}  100 s  val mIoU 45.67: a bad day" in text.getvalue()
-    assert "finished" not in text.getvalue()
+        parts = ("table: 1 finished, 1 failed, 1 running, 4 waiting, 1 queued", "/8", LINE.strip())
+        assert all(part in seen for part in parts), seen
+    assert f"failed   {LABEL}  2 min  val mIoU 45.67: a bad day" in text.getvalue()
+    assert not any(f"{word:<8} {LABEL}" in text.getvalue() for word in ("started", "finished"))
 
 
 def test_durations_are_read_by_people() -> None:

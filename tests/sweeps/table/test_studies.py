@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from sweeps.run.planner import Planner
 from sweeps.table.request import TableRequest
 from sweeps.table.table import load_table
 from sweeps.table_plan import make_request
-from sweeps.run.planner import Planner
 
 MISSING = "missing_image"
 
