@@ -63,7 +63,7 @@ def release(job: str) -> None:
         return queue()[job] == "RUNNING"
 
     until(lambda: queue()[job] == "PENDING", "the job to be queued again", 0.1)
-    until(starts, "the job to start again", 0.5)
+    until(starts, "the job to start again", 4.0)  # each one delays it by seconds
 
 
 def test_jobs_that_are_queued_again_give_the_same_runs(sweep: Sweep, straight: Sweep) -> None:

@@ -74,7 +74,7 @@ def release(executor: SubmititExecutor, job: str) -> None:
         return executor.state(job) == "running"
 
     until(lambda: executor.state(job) == "queued", "the job to be queued again", 0.1)
-    until(starts, "the job to start again", 0.5)
+    until(starts, "the job to start again", 4.0)  # each one delays it by seconds
 
 
 def end(executor: SubmititExecutor, *some: str) -> list[str]:
