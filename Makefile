@@ -1,6 +1,6 @@
 # make demo       install, train GRBM on the embedded data set, print the per-region table
 # make test       install, lint-free default test suite (offline, two cores, minutes)
-# make test-all   every test: the slow ones, the pages, PostgreSQL and MLflow servers on loopback
+# make test-all   every test: the slow ones, the pages, SLURM, Ray and an MLflow server on loopback
 # make lint       formatting, lint, types, spelling
 # make results  rewrites docs/results, its figures and the marked numbers from the archive results/
 # make docs       checks the pages and their code, builds the site (make site: alone)
@@ -33,12 +33,14 @@ demo: $(VENV)/.ready
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest $(SPREAD) -m "not slow and not docs"
 
-# TESTS=... selects some. Some tests start PostgreSQL, which the first call installs where it is missing.
+# TESTS=... selects some. Some tests start a SLURM, which the first call installs where it is missing;
+# where it cannot be installed, they are skipped and say so.
 test-all: $(VENV)/.ready
-	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || { \
-	  echo "PostgreSQL is missing; installing the Debian package"; \
-	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq --no-install-recommends postgresql; \
-	  else sudo apt-get update -qq && sudo apt-get install -y -qq --no-install-recommends postgresql; fi; }
+	@PATH="$$PATH:/usr/sbin"; command -v slurmctld >/dev/null && command -v munged >/dev/null || { \
+	  echo "SLURM is missing; installing the Debian packages"; \
+	  if [ "$$(id -u)" = 0 ]; then as=; else as="sudo -n"; fi; \
+	  $$as apt-get update -qq && $$as apt-get install -y -qq --no-install-recommends slurm-wlm munge \
+	  || echo "SLURM could not be installed: its tests are skipped"; }
 	$(BIN)/python -m pytest $(SPREAD) $(TESTS)
 
 lint: $(VENV)/.ready

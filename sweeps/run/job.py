@@ -103,7 +103,7 @@ class Job:
         """Start a command."""
         with self.work.log.open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-P", "-m", __name__, *words],
+                [sys.executable, "-P", "-m", __name__, str(os.getpid()), *words],
                 stdout=log,
                 stderr=log,
                 env={**os.environ, **self.work.environment},
@@ -203,5 +203,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)
     signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     end_with_parent(signal.SIGTERM)
+    if os.getppid() != int(sys.argv[1]):  # it has ended before, and no signal will come
+        sys.exit(128 + signal.SIGTERM)
     sys.path.append(str(Path.cwd()))  # last: a user's folder may hold packages of our names
-    become(sys.argv[1:])
+    become(sys.argv[2:])

@@ -45,7 +45,7 @@ class Keeper:
         self._ends: dict[str, str] = {}
 
     def submit(self, job: str, work: Work, resources: Mapping[str, Any], begin: int) -> int:
-        """Queue a job whose log has that size, unless it is queued or runs; the size when it was."""
+        """Queue a job whose log has that size, unless it has been before; the size at that time."""
         if self.state(job) != "running":
             self._ends.pop(job, None)
             self._begins[job] = begin

@@ -45,7 +45,7 @@ class Sweep:
     runs: Path
     data: Path
     words: tuple[str, ...] = ()
-    steps: int = 16
+    steps: int = 10
     varied: str = "seed=0,1,2,3"
     calls: int = 0
 

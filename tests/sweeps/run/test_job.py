@@ -174,6 +174,13 @@ def test_command_ends_with_its_job(tmp_path: Path) -> None:
     assert failed_before(work.log) == ""
 
 
+def test_command_whose_job_has_ended_before_it_begins_does_nothing(tmp_path: Path) -> None:
+    """A job that is queued again while it starts a command would leave it alone with the run."""
+    words = ("-m", jobs.__name__, "1", STEPS, "tell", str(tmp_path / "never"))
+    done = subprocess.run([sys.executable, "-P", *words], capture_output=True)
+    assert (done.returncode, done.stdout, (tmp_path / "never").exists()) == (143, b"", False)
+
+
 def test_signal_of_a_cluster_does_not_reach_the_command(tmp_path: Path) -> None:
     work = work_of(tmp_path, f"kill x {signal.SIGUSR2:d}", f"tell {tmp_path / 'place'}")
     assert Job(work)() == 0

@@ -38,16 +38,17 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[tuple[str, ...]]:
             yield ("hydra.sweeper.workers=2",)
 
 
-# Seconds: a driver starts within one or two, four runs take about thirty.
+# Seconds: a driver starts within one or two, with Ray in four; its runs take about fifteen.
 @pytest.mark.parametrize(
     ("cluster", "kills", "longest"),
-    [("basic", 10, 4.0), ("submitit_slurm", 10, 4.0), ("ray", 6, 7.0)],
+    [("basic", 10, 3.0), ("submitit_slurm", 10, 3.0), ("ray", 5, 6.0)],
     indirect=["cluster"],
 )
 def test_driver_killed_again_and_again(
     straight: Sweep, tmp_path: Path, cluster: tuple[str, ...], kills: int, longest: float
 ) -> None:
-    draw, sweep = random.Random(kills), Sweep(tmp_path / "runs", straight.data, cluster)
+    draw = random.Random(kills)
+    sweep = Sweep(tmp_path / "runs", straight.data, cluster, varied="seed=0,1,2")
     for _ in range(kills):
         process = sweep.start()
         assert process.pid is not None
@@ -57,7 +58,7 @@ def test_driver_killed_again_and_again(
             (os.killpg if is_group else os.kill)(process.pid, signal.SIGKILL)
         sweep.end(process)
     sweep.finish()
-    check(sweep, straight)
-    for seed in "0123":
+    check(sweep, straight, "012")
+    for seed in "012":
         log = sweep.log_of(seed)
-        assert (log.count("steps    16 of"), resumed_at(log)) == (1, []), "it is not disturbed"
+        assert (log.count("steps    10 of"), resumed_at(log)) == (1, []), "it is not disturbed"

@@ -41,18 +41,16 @@ def test_ray_of_its_own(straight: Sweep, tmp_path: Path, monkeypatch: pytest.Mon
         pytest.skip("a Ray runs on this machine")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     words = ("hydra/launcher=ray", "hydra.launcher.num_cpus=0.5")
-    sweep = Sweep(tmp_path / "runs", straight.data, words, steps=400, varied="seed=0,1")
+    sweep = Sweep(tmp_path / "runs", straight.data, words, steps=400, varied="seed=0")
     refused = sweep.start("hydra.sweeper.wait=false")
     assert sweep.end(refused) == 2
     assert "wait=false" in sweep.text
     process = sweep.start()
-    sweep.until_step(3, "0", "1")
+    sweep.until_step(3, "0")
     assert process.pid is not None
     os.kill(process.pid, signal.SIGTERM)
     assert sweep.end(process) == 143, sweep.text
-    assert [saved_at(sweep.log_of(seed)) for seed in "01"] == [
-        [steps(sweep.folders()[seed])[-1]] for seed in "01"
-    ]
+    assert saved_at(sweep.log_of("0")) == steps(sweep.folders()["0"])[-1:]
     until(lambda: not services.find_gcs_addresses(), "the end of Ray")
 
 

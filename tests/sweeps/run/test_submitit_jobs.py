@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from rgbt.checks import RunError
 from sweeps.run import submitit_jobs as jobs
 from sweeps.run.job import Step, Work, failure_reason
-from sweeps.run.submitit_jobs import SubmititExecutor
+from sweeps.run.submitit_jobs import SubmititExecutor, SubmititJob
 from tests.sweeps import clusters
 from tests.waiting import until
 
@@ -73,7 +74,7 @@ def release(executor: SubmititExecutor, job: str) -> None:
         return executor.state(job) == "running"
 
     until(lambda: executor.state(job) == "queued", "the job to be queued again", 0.1)
-    until(starts, "the job to start again", 0.5)
+    until(starts, "the job to start again", 4.0)  # each one delays it by seconds
 
 
 def end(executor: SubmititExecutor, *some: str) -> list[str]:
@@ -100,7 +101,9 @@ def test_several_points_are_one_array_and_one_is_queued_again(tmp_path: Path) ->
     assert names == [f"{names[0].partition('_')[0]}_{n}" for n in range(3)]
     until(lambda: all(map(begun, points)), "the commands")
     send(names[0], "USR2")  # as before the end of its time
-    send(names[2], "TERM", "USR2")  # as before another job takes its node
+    send(names[2], "TERM")  # as before another job takes its node
+    until(lambda: "exit code 143" in points[2].log.read_text(), "the command to save")
+    send(names[2], "USR2")
     for job in names[0], names[2]:
         release(executor, job)
     until(lambda: begun(points[0]) == begun(points[2]) == 2, "both commands again")
@@ -158,8 +161,11 @@ def test_cancel_saves_what_runs_and_removes_what_waits(tmp_path: Path) -> None:
     assert points[0].log.read_text().endswith("job: exit code 143\n")
     # A stop that has been obeyed, or that nobody could obey, does not stop the next jobs.
     names = executor.submit(points)
+    until(lambda: begun(points[0]) == 2, "the first command again")
+    time.sleep(2 * SubmititJob.poll_s)
     go(*points)
     assert end(executor, *names) == ["ended", "ended"]
+    assert [failure_reason(work.log, 0) for work in points] == ["", ""]
     assert [begun(work) for work in points] == [2, 1]
 
 
@@ -182,10 +188,11 @@ def test_next_driver_takes_over_what_is_queued_or_runs(tmp_path: Path) -> None:
 def test_next_driver_does_not_wait_for_a_job_that_is_stopped(tmp_path: Path) -> None:
     """The driver before was killed after it had stopped its jobs."""
     points, executor = works(tmp_path), slurm_executor(tmp_path)
-    executor.submit(points)
+    (stopped,) = executor.submit(points)
     until(lambda: begun(points[0]), "the command")
-    executor.cancel(executor.submit(points)[0])
+    executor.cancel(stopped)
     (job,) = slurm_executor(tmp_path).submit(points)
+    assert job != stopped
     go(*points)
     assert end(executor, job) == ["ended"]
     assert failure_reason(points[0].log, 0) == ""
