@@ -31,7 +31,7 @@ MOST_JOBS = 1000
 # Seconds between two questions to SLURM's controller, which serves all users.
 ASK_S = 5.0
 # Seconds that a job waits for its end after somebody else has stopped its command: SLURM queues a
-# job again that it pre-empts, but not one that ends by itself.
+# job again that it preempts, but not one that ends by itself.
 PREEMPTION_S = 300.0
 
 # Settings of the plugin that submitit takes without the name of the cluster before it.
