@@ -19,6 +19,7 @@ from rgbt.config.compose import OWN_FOLDERS, own_folders
 from rgbt.cores import usable_cores
 from rgbt.files.atomic import is_held
 from rgbt.runs.naming import TAGS
+from rgbt.runtime.signals import deferred
 from sweeps.evaluation import command_of, stored_at
 from sweeps.run.executors import Executor, open_executor
 from sweeps.run.job import TRAINING, Step, Work, failed_before
@@ -117,11 +118,12 @@ class Driver:
                 self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
-        jobs = self.executor.submit(works) if works else []
-        for task, work, size, job in zip(tasks, works, sizes, jobs, strict=True):
-            self.running.append(RunningPoint(task, job, work.log, size, limit_s))
-            if self.executor.is_lasting:
-                self.view.say("queued", f"{task.plan.point.label}, job {job}")
+        with deferred():  # a job that was begun and is not known would never be stopped
+            jobs = self.executor.submit(works) if works else []
+            for task, work, size, job in zip(tasks, works, sizes, jobs, strict=True):
+                self.running.append(RunningPoint(task, job, work.log, size, limit_s))
+                if self.executor.is_lasting:
+                    self.view.say("queued", f"{task.plan.point.label}, job {job}")
         self._report_cores()
         return bool(tasks)
 
