@@ -135,7 +135,8 @@ class Driver:
                 return self._finished_before(task, work.log)
         except RunError as error:  # its finished run is of other images
             return End("failed", str(error))
-        reason = failed_before(work.log) if self.settings.retry == "none" else ""
+        is_skipped = task.is_left and self.settings.retry == "none"
+        reason = failed_before(work.log) if is_skipped else ""
         return End("failed", reason) if reason else work
 
     def _finished_before(self, task: Task, log: Path) -> End:

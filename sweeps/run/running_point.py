@@ -30,12 +30,13 @@ PruningCallback = Callable[[MetricLine], str]
 class Task:
     """A point to execute; `report` gets every validation of its first run, once.
 
-    `number` is that of its trial in a search.
+    `number` is that of its trial in a search; `is_left`: a driver before has begun the trial.
     """
 
     plan: PlannedPoint
     number: int = -1
     report: PruningCallback | None = None
+    is_left: bool = False
 
 
 @dataclass(frozen=True)

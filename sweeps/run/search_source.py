@@ -49,6 +49,7 @@ class SearchSource:
         self._fixed, self._space, self._study = tuple(fixed), space, study
         self._settings, self._say, self._planner = settings, say, planner or Planner()
         stored = study.get_trials(deepcopy=False)
+        self._first = len(stored)  # number of the first trial of this driver
         self._left = [Trial(study, t._trial_id) for t in stored if t.state.name == "RUNNING"]
         # Steps of which the pruner knows.
         self._reported = {trial.number: trial.last_step or 0 for trial in stored}
@@ -69,7 +70,8 @@ class SearchSource:
                 continue
             for name, value in plan.attributes.items():
                 trial.set_user_attr(name, value)
-            return Task(plan, trial.number, self._pruning_callback(trial))
+            is_left = trial.number < self._first
+            return Task(plan, trial.number, self._pruning_callback(trial), is_left)
         return None
 
     def record(self, task: Task, end: End) -> End:
