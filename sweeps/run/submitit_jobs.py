@@ -6,7 +6,7 @@ again near its time limit and after pre-emption; its run resumes from the step i
 
 from __future__ import annotations
 
-import getpass
+import os
 import re
 import signal
 import subprocess
@@ -145,9 +145,15 @@ def stop_file(work: Work) -> Path:
 def states_of_slurm() -> dict[str, str]:
     """The jobs of this user and their states; SLURM forgets one some minutes after its end."""
     command = ("squeue", "--noheader", "--array", "--states=all", "--format=%i|%T")
-    user = f"--user={getpass.getuser()}"
+    # Filters of the user (SQUEUE_PARTITION) would hide jobs; nor need USER be who submits.
+    environment = {name: each for name, each in os.environ.items() if name[:7] != "SQUEUE_"}
     text = subprocess.run(
-        [*command, user], check=True, capture_output=True, text=True, timeout=60
+        [*command, f"--user={os.getuid()}"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
     ).stdout
     found = dict(line.strip().split("|") for line in text.splitlines() if "|" in line)
     return {job: _word(state) for job, state in found.items()}
