@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 from rgbt.checks import one_line
 from rgbt.files.atomic import is_held
+from rgbt.files.plain_files import read_bytes
 from rgbt.runs.folder import is_finished
 from rgbt.runtime.group import end_with_parent
 
@@ -163,7 +164,7 @@ STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, s
 
 def failure_reason(log: Path, begin: int) -> str:
     """Why a job failed: the last message in its log behind byte `begin`; "": done."""
-    text = log.read_bytes()[begin:].decode(errors="replace") if log.exists() else ""
+    text = read_bytes(log)[begin:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     end = _end(lines)
     if not end.startswith("exit code"):
@@ -179,8 +180,9 @@ def failed_before(log: Path) -> str:
     """Why the last job with this log failed by itself; "": it did not, or nobody stopped it."""
     if not log.exists():
         return ""
-    begin = log.read_bytes().rfind(f"{SAYS}{STARTED}".encode())
-    end = _end(log.read_bytes()[max(0, begin) :].decode(errors="replace").splitlines())
+    content = read_bytes(log)
+    begin = content.rfind(f"{SAYS}{STARTED}".encode())
+    end = _end(content[max(0, begin) :].decode(errors="replace").splitlines())
     failed = end.startswith("exit code") and end not in STOPPED
     return failure_reason(log, max(0, begin)) if failed else ""
 

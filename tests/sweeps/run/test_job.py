@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.files.atomic import holding
+from rgbt.checks import InputError
 from sweeps.run import job as jobs
 from sweeps.run.job import Child, Job, Step, Work, failed_before, failure_reason, how_ended
 from tests.waiting import is_alive, until
@@ -237,3 +238,11 @@ def test_failure_reason_is_the_last_message(
 def test_exit_codes_in_words() -> None:
     words = [how_ended(code) for code in (0, 3, -15, -99)]
     assert words == ["done", "exit code 3", "stopped by SIGTERM", "stopped by signal 99"]
+
+
+def test_a_pipe_in_place_of_a_log_is_refused(tmp_path: Path) -> None:
+    """It would be waited for."""
+    os.mkfifo(tmp_path / "run.log")
+    for read in (failed_before, lambda log: failure_reason(log, 0)):
+        with pytest.raises(InputError, match="not a regular file"):
+            read(tmp_path / "run.log")
