@@ -157,7 +157,7 @@ def how_ended(code: int) -> str:
     return f"stopped by {name}{' (out of memory?)' if name == 'SIGKILL' else ''}"
 
 
-LOST = "its job was lost"
+LOST, TOO_LONG = "its job was lost", "stopped after timeout_minutes"
 # Exit codes of a command that a signal has stopped, which resumes.
 STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 
@@ -183,7 +183,7 @@ def failed_before(log: Path) -> str:
     content = read_bytes(log)
     begin = content.rfind(f"{SAYS}{STARTED}".encode())
     end = _end(content[max(0, begin) :].decode(errors="replace").splitlines())
-    failed = end.startswith("exit code") and end not in STOPPED
+    failed = end == TOO_LONG or (end.startswith("exit code") and end not in STOPPED)
     return failure_reason(log, max(0, begin)) if failed else ""
 
 

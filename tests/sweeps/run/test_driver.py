@@ -145,6 +145,9 @@ def test_a_point_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.Monk
     assert desk.states() == ["failed", "finished"]
     assert "timeout_minutes" in desk.view.ends[0][2]
     assert desk.executor.stopped() == ["0"]
+    again = ListDesk(tmp_path, 2).run()
+    assert (again.states(), again.executor.submits) == (["failed", "finished"], [])
+    assert set(ListDesk(tmp_path, 2, retry="failed").run().states()) == {"finished"}
     # Jobs that wait for their turn have no limit.
     cluster = lasting(hang)
     cluster.is_full = True

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from rgbt.files.atomic import holding
 from rgbt.checks import InputError
+from rgbt.files.atomic import holding
 from sweeps.run import job as jobs
 from sweeps.run.job import Child, Job, Step, Work, failed_before, failure_reason, how_ended
 from tests.waiting import is_alive, until
