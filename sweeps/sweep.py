@@ -75,7 +75,8 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         search(Search(name, (*base, *fixed), space, runs, identity), settings)
         return
 
-    unused = [key for key in ("trials", "hours", "pruner") if getattr(settings, key) is not None]
+    ours = ("trials", "hours", "pruner", "storage")
+    unused = [key for key in ours if getattr(settings, key) is not None]
     if unused or settings.replicates > 1:
         key = [*unused, "replicates"][0]
         raise InputError(f"hydra.sweeper.{key} is for a search, but no key has a range.")
