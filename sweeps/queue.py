@@ -23,6 +23,7 @@ from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
 from sweeps.run.run_store import RunStore
 from sweeps.settings import SweepSettings
+from sweeps.space import signature
 from sweeps.table.request import TAG, seed_of
 from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
@@ -165,7 +166,9 @@ def run_queue(
     if not plans:
         raise InputError(f"table={options.table}: none of them can be trained.")
     queue, title = Queue(plans, runs, planner, options.dry_run), f"tables {options.scale}"
-    points = PointList(title, title, queue.points, runs, planner, more=queue.more, rank=queue.rank)
+    identity = signature([plan.points.study for plan in plans])
+    study = f"{title} {identity[:6]}"  # a driver of other tables does not run these
+    points = PointList(study, title, queue.points, runs, planner, more=queue.more, rank=queue.rank)
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0

@@ -87,6 +87,12 @@ def main(options: Options, overrides: list[str]) -> int:
 
     of_hydra = [word for word in overrides if word.startswith(HYDRA)]
     overrides = [word for word in overrides if word not in of_hydra]
+    for word in overrides:  # of a row they would have no effect
+        if word.lstrip("+~").startswith(("hydra/", "hydra.")) and "hydra.searchpath" not in word:
+            raise InputError(
+                f"{word}: of Hydra's words, hydra/launcher=..., hydra.launcher.KEY=... and "
+                "hydra.searchpath=... are possible here; workers=2 etc. are options."
+            )
     settings = settings_of(options, of_hydra)
     runs, planner = stored_and_planner(options, overrides)
     if options.table == "all" or "," in options.table:

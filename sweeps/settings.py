@@ -113,6 +113,11 @@ def read_settings(node: DictConfig, launcher: Launcher) -> SweepSettings:
     settings = cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))
     if not settings.wait and launcher.name in ("basic", "submitit_local"):
         raise InputError("hydra.sweeper.wait=false: runs of this machine end with the command.")
+    if not settings.wait and settings.timeout_minutes is not None:
+        raise InputError(
+            "hydra.sweeper.timeout_minutes needs hydra.sweeper.wait=true: the command stops the "
+            "jobs. SLURM has a limit of its own, hydra.launcher.timeout_min."
+        )
     return replace(settings, launcher=launcher)
 
 

@@ -21,7 +21,7 @@ from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps import attributes as names
 from sweeps import space as spaces
-from sweeps.point import UNFINISHED, Point, short_names
+from sweeps.point import Point, short_names
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.run import point_list
 from sweeps.run.driver import drive
@@ -75,7 +75,8 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         search(Search(name, (*base, *fixed), space, runs, identity), settings)
         return
 
-    unused = [key for key in ("trials", "hours", "pruner") if getattr(settings, key) is not None]
+    ours = ("trials", "hours", "pruner", "storage")
+    unused = [key for key in ours if getattr(settings, key) is not None]
     if unused or settings.replicates > 1:
         key = [*unused, "replicates"][0]
         raise InputError(f"hydra.sweeper.{key} is for a search, but no key has a range.")
@@ -130,7 +131,7 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         info(other_code)
     if settings.dry_run:
         seconds = point_list.estimated_seconds(outcomes, settings.workers or 1)
-        missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
+        missing = len({outcome.keys for outcome in outcomes if outcome.state == "waiting"})
         guess = "" if seconds is None else f", about {duration(seconds)}"
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         return

@@ -222,5 +222,7 @@ def plan_table(
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
     title, points = f"{name} scale={request.scale}", tuple(request.points())
-    planned = PointList(f"table/{name}", title, points, runs, planner, more)
+    # Other rows, seeds or another scale are another study: its driver does not run these.
+    study = " ".join(["table/" + name, request.variant, *map(str, [] if adds else seeds)])
+    planned = PointList(study, title, points, runs, planner, more)
     return TablePlan(request, judge, planned, more, rows, external)

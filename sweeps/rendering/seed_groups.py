@@ -23,7 +23,10 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     groups: dict[str, list[Outcome]] = {}
     scores = {}
     for outcome in outcomes:
-        groups.setdefault(_configuration(outcome.point), []).append(outcome)
+        members = groups.setdefault(_configuration(outcome.point), [])
+        # A seed that was typed twice is one run.
+        if not outcome.keys or all(each.keys != outcome.keys for each in members):
+            members.append(outcome)
         is_finished = outcome.state == "finished" and outcome.results
         scores[id(outcome)] = outcome.results[0].recorded_scores() if is_finished else {}
     known = {name for each in scores.values() for name in each}

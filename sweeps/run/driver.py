@@ -18,7 +18,9 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.compose import OWN_FOLDERS, own_folders
 from rgbt.cores import usable_cores
 from rgbt.files.atomic import is_held
+from rgbt.files.plain_files import inside
 from rgbt.runs.naming import TAGS
+from rgbt.runtime.signals import deferred
 from sweeps.evaluation import command_of, stored_at
 from sweeps.run.executors import Executor, open_executor
 from sweeps.run.job import TRAINING, Step, Work, failed_before
@@ -117,11 +119,12 @@ class Driver:
                 self.view.say(end.state, f"{task.plan.point.label}  {end.reason}".rstrip())
         sizes = [work.log.stat().st_size if work.log.exists() else 0 for work in works]
         limit_s = 60 * (self.settings.timeout_minutes or math.inf)
-        jobs = self.executor.submit(works) if works else []
-        for task, work, size, job in zip(tasks, works, sizes, jobs, strict=True):
-            self.running.append(RunningPoint(task, job, work.log, size, limit_s))
-            if self.executor.is_lasting:
-                self.view.say("queued", f"{task.plan.point.label}, job {job}")
+        with deferred():  # a job that was begun and is not known would never be stopped
+            jobs = self.executor.submit(works) if works else []
+            for task, work, size, job in zip(tasks, works, sizes, jobs, strict=True):
+                self.running.append(RunningPoint(task, job, work.log, size, limit_s))
+                if self.executor.is_lasting:
+                    self.view.say("queued", f"{task.plan.point.label}, job {job}")
         self._report_cores()
         return bool(tasks)
 
@@ -133,7 +136,8 @@ class Driver:
                 return self._finished_before(task, work.log)
         except RunError as error:  # its finished run is of other images
             return End("failed", str(error))
-        reason = failed_before(work.log) if self.settings.retry == "none" else ""
+        is_skipped = task.is_left and self.settings.retry == "none"
+        reason = failed_before(work.log) if is_skipped else ""
         return End("failed", reason) if reason else work
 
     def _finished_before(self, task: Task, log: Path) -> End:
@@ -201,8 +205,8 @@ def work_of(plan: PlannedPoint, runs: RunStore, trust: str) -> Work:
 
 
 def log_of(plan: PlannedPoint, runs: RunStore) -> Path:
-    """The file with the output of the jobs of a point."""
-    return runs.runs_dir / LOGS / f"{plan.key}.log"
+    """The file with the output of the jobs of a point; InputError for a link out of the runs."""
+    return inside(runs.runs_dir / LOGS / f"{plan.key}.log", runs.runs_dir)
 
 
 def drive(view: ProgressView, source: Source, runs: RunStore, settings: SweepSettings) -> None:

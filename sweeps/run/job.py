@@ -20,12 +20,13 @@ from typing import NamedTuple
 
 from rgbt.checks import one_line
 from rgbt.files.atomic import is_held
+from rgbt.files.plain_files import read_bytes
 from rgbt.runs.folder import is_finished
 from rgbt.runtime.group import end_with_parent
 
 TRAINING = "rgbt.run"
 # What a job writes into its log: this, that it started, and how it ended.
-SAYS, STARTED, DONE = "job: ", "started", "done"
+SAYS, STARTED, DONE = "rgbt job: ", "started", "done"
 
 
 class Step(NamedTuple):
@@ -156,14 +157,14 @@ def how_ended(code: int) -> str:
     return f"stopped by {name}{' (out of memory?)' if name == 'SIGKILL' else ''}"
 
 
-LOST = "its job was lost"
+LOST, TOO_LONG = "its job was lost", "stopped after timeout_minutes"
 # Exit codes of a command that a signal has stopped, which resumes.
 STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 
 
 def failure_reason(log: Path, begin: int) -> str:
     """Why a job failed: the last message in its log behind byte `begin`; "": done."""
-    text = log.read_bytes()[begin:].decode(errors="replace") if log.exists() else ""
+    text = read_bytes(log)[begin:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     end = _end(lines)
     if not end.startswith("exit code"):
@@ -179,9 +180,10 @@ def failed_before(log: Path) -> str:
     """Why the last job with this log failed by itself; "": it did not, or nobody stopped it."""
     if not log.exists():
         return ""
-    begin = log.read_bytes().rfind(f"{SAYS}{STARTED}".encode())
-    end = _end(log.read_bytes()[max(0, begin) :].decode(errors="replace").splitlines())
-    failed = end.startswith("exit code") and end not in STOPPED
+    content = read_bytes(log)
+    begin = content.rfind(f"{SAYS}{STARTED}".encode())
+    end = _end(content[max(0, begin) :].decode(errors="replace").splitlines())
+    failed = end == TOO_LONG or (end.startswith("exit code") and end not in STOPPED)
     return failure_reason(log, max(0, begin)) if failed else ""
 
 

@@ -12,7 +12,7 @@ from statistics import median
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
-from rgbt.files.atomic import is_held, write_atomic
+from rgbt.files.atomic import check_writable, is_held, write_atomic
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
@@ -229,6 +229,12 @@ def run_points(
 
 def commands_line(points: PointList, settings: SweepSettings) -> str:
     """Write a line of shell for every point that is not finished; what was done, in a sentence."""
+    file = Path(settings.commands or "")
+    check_writable(f"commands={file}", file.parent)
+    if file.is_symlink() or (file.exists() and not file.is_file()):
+        raise InputError(f"commands={file}: it is not a regular file.")
+    if settings.dry_run or settings.gpus is not None or settings.timeout_minutes is not None:
+        raise InputError("commands: dry_run, gpus and timeout_minutes have no effect on the lines.")
     source, lines = ListSource(points, settings, is_dry=True), list[str]()
     while (task := source.next()) is not None:
         try:
@@ -239,7 +245,6 @@ def commands_line(points: PointList, settings: SweepSettings) -> str:
         variables = [f"{name}={value}" for name, value in work.environment.items() if value]
         steps = (["env", *variables, sys.executable, "-m", *step.words] for step in work.steps)
         lines.append(" && ".join(map(shlex.join, steps)))
-    file = Path(settings.commands or "")
     write_atomic(file, "".join(f"{line}\n" for line in lines).encode())
     return f"{len(lines)} commands in {file}, one a line; run them in this folder."
 

@@ -17,7 +17,7 @@ from rgbt.runs.folder import MetricLine
 from rgbt.runs.result import RunResult
 from sweeps import attributes as names
 from sweeps.run.executors import Executor
-from sweeps.run.job import LOST, failure_reason
+from sweeps.run.job import LOST, SAYS, TOO_LONG, failure_reason
 from sweeps.run.planner import PlannedPoint
 from sweeps.run.run_store import RunStore
 from sweeps.settings import Objective
@@ -30,12 +30,13 @@ PruningCallback = Callable[[MetricLine], str]
 class Task:
     """A point to execute; `report` gets every validation of its first run, once.
 
-    `number` is that of its trial in a search.
+    `number` is that of its trial in a search; `is_left`: a driver before has begun the trial.
     """
 
     plan: PlannedPoint
     number: int = -1
     report: PruningCallback | None = None
+    is_left: bool = False
 
 
 @dataclass(frozen=True)
@@ -129,11 +130,14 @@ class RunningPoint:
         reason = self.read(runs.runs_dir)
         if state not in ("queued", "running"):
             found = self._end or self._how_ended(state, runs)
+            if found.reason == TOO_LONG and self.log.is_file():  # a later call skips it
+                with self.log.open("a") as log:
+                    log.write(f"{SAYS}{TOO_LONG}\n")
             return replace(found, seconds=round(self.seconds, 1))
         if self._end is None and reason:
             self._end = End("pruned", reason)
         elif self._end is None and self.is_started and self.seconds > self.timeout_s:
-            self._end = End("failed", "stopped after timeout_minutes")
+            self._end = End("failed", TOO_LONG)
         else:
             return None
         executor.cancel(self.job)

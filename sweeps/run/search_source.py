@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -49,6 +51,7 @@ class SearchSource:
         self._fixed, self._space, self._study = tuple(fixed), space, study
         self._settings, self._say, self._planner = settings, say, planner or Planner()
         stored = study.get_trials(deepcopy=False)
+        self._first = len(stored)  # number of the first trial of this driver
         self._left = [Trial(study, t._trial_id) for t in stored if t.state.name == "RUNNING"]
         # Steps of which the pruner knows.
         self._reported = {trial.number: trial.last_step or 0 for trial in stored}
@@ -70,7 +73,8 @@ class SearchSource:
             trial.set_user_attr(names.LABEL, plan.point.label)
             trial.set_user_attr(names.RUNS, [run.key for run in plan.runs])
             trial.set_user_attr(names.PIXELS, plan.runs[0].scale.pixel_factor)
-            return Task(plan, trial.number, self._pruning_callback(trial))
+            is_left = trial.number < self._first
+            return Task(plan, trial.number, self._pruning_callback(trial), is_left)
         return None
 
     def record(self, task: Task, end: End) -> End:
@@ -95,6 +99,9 @@ class SearchSource:
         total, known = self._settings.trials, self._study.get_trials(deepcopy=False)
         if total is not None and sum(trial.state.name != "WAITING" for trial in known) >= total:
             return None
+        tried = {json.dumps(trial.params, sort_keys=True) for trial in known}
+        if total is None and len(tried) >= _number_of_points(self._space):
+            return None  # by hours, it would propose the same points again and again
         return self._study.ask(dict(self._space))
 
     def _point(self, trial: Trial) -> Point:
@@ -136,6 +143,21 @@ class SearchSource:
             return f"pruned at step {line.step}" if is_pruned else ""
 
         return report
+
+
+def _number_of_points(space: Space) -> float:
+    """How many points a space has; infinite where a range has no steps."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+    found = 1.0
+    for each in space.values():
+        if isinstance(each, CategoricalDistribution):
+            found *= len(each.choices)
+        elif isinstance(each, FloatDistribution) and each.step is None:
+            return math.inf
+        else:
+            found *= (each.high - each.low) // (each.step or 1) + 1
+    return found
 
 
 def _short(override: str) -> str:

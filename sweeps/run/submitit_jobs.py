@@ -6,7 +6,7 @@ again near its time limit and after pre-emption; its run resumes from the step i
 
 from __future__ import annotations
 
-import getpass
+import os
 import re
 import signal
 import subprocess
@@ -21,6 +21,7 @@ from submitit.core.utils import FailedJobError, FailedSubmissionError
 from submitit.helpers import DelayedSubmission
 
 from rgbt.checks import InputError, RunError, one_line
+from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import read_json, write_json
 from sweeps.run.job import Job, Work
 
@@ -106,7 +107,10 @@ class SubmititExecutor:
         if time.monotonic() - self._asked_at > ASK_S:
             with suppress(RunError):  # a controller that is busy
                 self._ask()
-        return self._states.get(job, "ended")
+        state = self._states.get(job, "ended")
+        if state in ("queued", "running", "ended") or job not in self._jobs:
+            return state
+        return f"{state}; see {self._jobs[job].paths.stderr}"
 
     def _ask(self) -> None:
         self._asked_at = time.monotonic()
@@ -117,7 +121,7 @@ class SubmititExecutor:
 
     def cancel(self, job: str) -> None:
         """See `Executor.cancel`."""
-        stop_file(self._works[job]).touch()
+        write_atomic(stop_file(self._works[job]), b"")
         if self._cluster == "slurm":
             subprocess.run(["scancel", "--quiet", "--state=PENDING", job], check=False)
             self._asked_at = float("-inf")
@@ -145,9 +149,15 @@ def stop_file(work: Work) -> Path:
 def states_of_slurm() -> dict[str, str]:
     """The jobs of this user and their states; SLURM forgets one some minutes after its end."""
     command = ("squeue", "--noheader", "--array", "--states=all", "--format=%i|%T")
-    user = f"--user={getpass.getuser()}"
+    # Filters of the user (SQUEUE_PARTITION) would hide jobs; nor need USER be who submits.
+    environment = {name: each for name, each in os.environ.items() if name[:7] != "SQUEUE_"}
     text = subprocess.run(
-        [*command, user], check=True, capture_output=True, text=True, timeout=60
+        [*command, f"--user={os.getuid()}"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
     ).stdout
     found = dict(line.strip().split("|") for line in text.splitlines() if "|" in line)
     return {job: _word(state) for job, state in found.items()}
@@ -158,7 +168,7 @@ def _word(state: str) -> str:
         return "queued"
     if state in RUNNING:
         return "running"
-    return "ended" if state in ("COMPLETED", "FAILED") else state.lower().replace("_", " ")
+    return "ended" if state == "COMPLETED" else state.lower().replace("_", " ")
 
 
 def _executor(cluster: str, options: Mapping[str, Any]) -> submitit.AutoExecutor:

@@ -75,7 +75,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     assert (code, err) == (0, "")
     (wanted, settings), *others = asked
     assert not others
-    assert wanted.study == "table/my/small"
+    assert wanted.study == "table/my/small demo 0 1"
     assert wanted.planner.base == ("runs_dir=runs", "tracking=none")
     assert [point.overrides for point in wanted.points][:2] == [
         ("+experiment=grbm", "masker.sigma_div=1", "dataset.root=/x", "seed=0"),
@@ -155,3 +155,22 @@ def test_options_of_execution_are_sweep_settings() -> None:
     found = settings_of(Options("my/small", **changes), words)
     assert vars(found).items() >= {**changes, "commands": "file"}.items()
     assert (found.launcher.name, found.launcher.options["num_gpus"]) == ("ray", 0.25)
+
+
+@pytest.mark.parametrize("word", ["hydra.sweeper.workers=2", "+hydra.launcher.key=1"])
+def test_words_of_hydra_that_would_have_no_effect_are_refused(
+    place: Path, call: Call, word: str
+) -> None:
+    code, _, err = call(entry, "table=my/small", "dry_run=true", word)
+    assert code == 2
+    assert_one_sentence(err, f"{word}: of Hydra's words")
+
+
+def test_other_rows_seeds_and_scales_are_other_studies(
+    place: Path, call: Call, driven: Driven
+) -> None:
+    """Their commands run at the same time: the driver of one does not run the others."""
+    asked = driven("failed")
+    for more in ((), ("rows=1",), ("seeds=2",), ("scale=bench",)):
+        call(entry, "table=my/small", *more)
+    assert len({points.study for points, _ in asked}) == 4

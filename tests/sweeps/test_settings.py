@@ -79,3 +79,8 @@ def test_objectives_reported_during_training() -> None:
     metrics = ("val/night/mIoU", "val/region/2", "val/TC/aligned", "test/Var")
     followed = [Objective(metric, "maximize").is_reported for metric in metrics]
     assert followed == [True, True, False, False]
+
+
+def test_a_time_limit_needs_a_command_that_waits() -> None:
+    with pytest.raises(InputError, match=r"timeout_minutes needs hydra\.sweeper\.wait=true"):
+        changed(wait=False, timeout_minutes=5)

@@ -124,7 +124,9 @@ def test_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> No
     assert {"hydra.mode=RUN", "masker.sigma_div=4"} <= set(wanted.fixed)
 
 
-@pytest.mark.parametrize(("key", "value"), [("trials", 3), ("replicates", 2)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("trials", 3), ("replicates", 2), ("storage", "sqlite:///x.db")]
+)
 def test_search_settings_of_grid_are_refused(tmp_path: Path, key: str, value: Any) -> None:
     with pytest.raises(InputError, match=f"hydra.sweeper.{key}"):
         call(tmp_path, *GRID, **{key: value})

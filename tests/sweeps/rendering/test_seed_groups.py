@@ -40,3 +40,9 @@ def test_group_grid_shows_mean_and_sample_sd(tmp_path: Path) -> None:
         ("sigma_div=3 seed=0", "running", "l", ""),
         ("sigma_div=3 seed=1", "failed", "m", "a bad day"),
     )
+
+
+def test_a_seed_that_was_typed_twice_counts_once(tmp_path: Path) -> None:
+    first, second = (made(tmp_path, f"x=1 seed={n}", mIoU=0.4 + n / 10, Var=2.0) for n in (0, 1))
+    (row,) = group_grid("study", [first, first, second]).rows
+    assert row[1:3] == ("2", "45.00 ± 7.07")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +15,13 @@ import pytest
 from rgbt.checks import InputError, RunError
 from rgbt.files.atomic import holding
 from rgbt.runs.naming import TAGS
+from rgbt.runtime.signals import answered
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.run import driver as drivers
 from sweeps.run import running_point
 from sweeps.run.driver import work_of
+from sweeps.run.job import Work
 from sweeps.settings import Objective
 from tests.sweeps.fakes import (
     Call,
@@ -141,6 +145,9 @@ def test_a_point_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.Monk
     assert desk.states() == ["failed", "finished"]
     assert "timeout_minutes" in desk.view.ends[0][2]
     assert desk.executor.stopped() == ["0"]
+    again = ListDesk(tmp_path, 2).run()
+    assert (again.states(), again.executor.submits) == (["failed", "finished"], [])
+    assert set(ListDesk(tmp_path, 2, retry="failed").run().states()) == {"finished"}
     # Jobs that wait for their turn have no limit.
     cluster = lasting(hang)
     cluster.is_full = True
@@ -167,6 +174,21 @@ def test_ctrl_c_stops_jobs_that_would_end_with_the_command(
     again = ListDesk(tmp_path, 3, executor=executor).run()
     assert set(again.states()) == {"finished"}
     assert len(executor.jobs) == 3 + len(stopped)
+
+
+def test_ctrl_c_while_jobs_are_started_stops_them_too(tmp_path: Path) -> None:
+    """The first one takes seconds: its process imports torch."""
+    desk = ListDesk(tmp_path, 2, hang, slots=2)
+    submit = desk.executor.submit
+
+    def interrupted(works: Sequence[Work]) -> list[str]:
+        signal.raise_signal(signal.SIGINT)
+        return submit(works)
+
+    desk.executor.submit = interrupted  # type: ignore[method-assign]
+    with answered(), pytest.raises(KeyboardInterrupt):
+        desk.run()
+    assert desk.executor.stopped() == ["0", "1"]
 
 
 def test_without_wait_a_call_submits_and_the_next_records(tmp_path: Path) -> None:

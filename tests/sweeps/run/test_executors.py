@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 from hydra.errors import MissingConfigException
 
@@ -42,3 +45,17 @@ def test_gpus_are_chosen_for_jobs_of_this_machine_alone() -> None:
         open_executor(Launcher("ray"), None, [0])
     found = [open_executor(Launcher(), workers, None) for workers in (None, 3)]
     assert [(type(each), each.slots) for each in found] == [(LocalExecutor, 1), (LocalExecutor, 3)]
+
+
+def test_jobs_of_slurm_are_found_with_any_variables_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of squeue filter its list, and USER may name another person."""
+    submitit_jobs = pytest.importorskip("sweeps.run.submitit_jobs", exc_type=ImportError)
+    squeue = tmp_path / "squeue"
+    squeue.write_text('#!/bin/sh\nenv | grep -q ^SQUEUE_ || echo "7_${5#--user=}|PENDING"\n')
+    squeue.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    for name in ("USER", "LOGNAME", "SQUEUE_PARTITION", "SQUEUE_NAMES"):
+        monkeypatch.setenv(name, "other")
+    assert submitit_jobs.states_of_slurm() == {f"7_{os.getuid()}": "queued"}

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from rgbt.checks import InputError
 from rgbt.files.atomic import holding
 from sweeps.run import job as jobs
 from sweeps.run.job import Child, Job, Step, Work, failed_before, failure_reason, how_ended
@@ -29,7 +30,7 @@ def work_of(folder: Path, *steps: str, **environment: str) -> Work:
 
 
 def said(work: Work) -> list[str]:
-    return [line for line in work.log.read_text().splitlines() if line.startswith("job: ")]
+    return [line for line in work.log.read_text().splitlines() if line.startswith("rgbt job: ")]
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +55,7 @@ def test_command_gets_words_folder_and_variables(tmp_path: Path) -> None:
         "interrupt": True,
     }
     assert (tmp_path / "other").exists()
-    assert said(work) == [f"job: started on {os.uname().nodename}", "job: done"]
+    assert said(work) == [f"rgbt job: started on {os.uname().nodename}", "rgbt job: done"]
     assert "GIVEN" not in os.environ
     assert failure_reason(work.log, 0) == failed_before(work.log) == ""
 
@@ -73,7 +74,7 @@ def test_first_step_that_fails_is_the_last(
 ) -> None:
     work = work_of(tmp_path, words, f"tell {tmp_path / 'never'}")
     work.log.parent.mkdir()
-    work.log.write_text("job: started\nrgbt: of another job\njob: exit code 1\n")
+    work.log.write_text("rgbt job: started\nrgbt: of another job\nrgbt job: exit code 1\n")
     begin = work.log.stat().st_size
     assert Job(work)() == code
     assert not (tmp_path / "never").exists()
@@ -228,9 +229,9 @@ See the documentation.
 def test_failure_reason_is_the_last_message(
     tmp_path: Path, end: str, text: str, reason: str
 ) -> None:
-    before = "job: started\nrgbt: an old mistake é\njob: exit code 1\n".encode()
+    before = "rgbt job: started\nrgbt: an old mistake é\nrgbt job: exit code 1\n".encode()
     log = tmp_path / "run.log"
-    said = f"job: started on é\n{text}\njob: {end}\n".encode(errors="surrogateescape")
+    said = f"rgbt job: started on é\n{text}\nrgbt job: {end}\n".encode(errors="surrogateescape")
     log.write_bytes(before + said)
     found = failure_reason(log, len(before))
     assert found.startswith(reason)
@@ -244,3 +245,11 @@ def test_failure_reason_is_the_last_message(
 def test_exit_codes_in_words() -> None:
     words = [how_ended(code) for code in (0, 3, -15, -99)]
     assert words == ["done", "exit code 3", "stopped by SIGTERM", "stopped by signal 99"]
+
+
+def test_a_pipe_in_place_of_a_log_is_refused(tmp_path: Path) -> None:
+    """It would be waited for."""
+    os.mkfifo(tmp_path / "run.log")
+    for read in (failed_before, lambda log: failure_reason(log, 0)):
+        with pytest.raises(InputError, match="not a regular file"):
+            read(tmp_path / "run.log")

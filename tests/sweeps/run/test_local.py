@@ -74,7 +74,7 @@ def test_nothing_stays_from_job_to_job(executor: Executor, tmp_path: Path) -> No
     assert (told["given"], told["folder"], told["interrupt"]) == ("it", str(tmp_path), True)
     executor.end(executor.start(tmp_path, f"tell {place}"))
     assert json.loads(place.read_text())["given"] is None
-    assert (tmp_path / "log").read_text().count("said tell\njob: done\n") == 2
+    assert (tmp_path / "log").read_text().count("said tell\nrgbt job: done\n") == 2
     assert executor.state(next(iter(executor._processes))) == "ended"
 
 
@@ -179,7 +179,7 @@ def test_run_continues_when_driver_is_killed(driver: subprocess.Popen[str], tmp_
     assert is_alive(pid)
     (tmp_path / "pid.go").touch()
     until((tmp_path / "pid.done").exists, "the orphan to finish its work")
-    until(lambda: "job: done" in (tmp_path / "log").read_text(), "the end of its job")
+    until(lambda: "rgbt job: done" in (tmp_path / "log").read_text(), "the end of its job")
 
 
 def test_run_command_has_reason_of_failure(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from sweeps.settings import Objective
 from tests.sweeps.fakes import (
     Call,
     FakePlanner,
+    ListDesk,
     Process,
     SearchDesk,
     fail,
@@ -167,6 +168,22 @@ def test_a_run_that_ended_without_a_driver_is_said_as_it_counts(tmp_path: Path) 
     again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
     assert (again.states(), again.executor.submits) == (["FAIL"], [])
     assert [how for how, _ in again.view.said] == ["failed"]
+
+
+def test_a_new_trial_is_run_whatever_failed_before(tmp_path: Path) -> None:
+    """Another search, or an earlier trial with these values; what was wrong may be repaired."""
+    first = SearchDesk(tmp_path, fail, trials=1).run()
+    again = SearchDesk(tmp_path, trials=1).run()
+    assert (first.states(), again.states()) == (["FAIL"], ["COMPLETE"])
+    assert first.trials[0].params == again.trials[0].params
+
+
+def test_a_trial_that_failed_without_a_driver_is_not_run_again(tmp_path: Path) -> None:
+    desk = SearchDesk(tmp_path, trials=1)
+    lost = taken(desk)
+    ListDesk(tmp_path, [lost.plan.point], fail).run()
+    again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
+    assert (again.states(), again.executor.submits) == (["FAIL"], [])
 
 
 SPACE = {

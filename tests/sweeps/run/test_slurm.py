@@ -176,7 +176,7 @@ def test_table_with_evaluations(short: Sweep, tmp_path: Path) -> None:
     assert len(set(re.findall(r"job (\d+_\d)\b", short.text))) == 2
     for log in (short.runs / ".logs").glob("*.log"):
         text = log.read_text()
-        assert (text.count("job: started"), text.count("job: done")) == (1, 1)
+        assert (text.count("rgbt job: started"), text.count("rgbt job: done")) == (1, 1)
     scores = [line for line in short.text.splitlines() if re.match(r" +(one|two) ", line)]
     assert len(scores) == 2
 

@@ -158,7 +158,7 @@ def test_cancel_saves_what_runs_and_removes_what_waits(tmp_path: Path) -> None:
     for job in names:
         executor.cancel(job)
     assert end(executor, *names) == ["ended", "cancelled"]
-    assert points[0].log.read_text().endswith("job: exit code 143\n")
+    assert points[0].log.read_text().endswith("rgbt job: exit code 143\n")
     # A stop that has been obeyed, or that nobody could obey, does not stop the next jobs.
     names = executor.submit(points)
     until(lambda: begun(points[0]) == 2, "the first command again")
