@@ -55,12 +55,10 @@ def main(options: Options, overrides: list[str]) -> int:
     from sweeps.run.optuna_study import known_studies, storage_url, study_folder
 
     known = known_studies(options.storage, options.runs_dir)
+    where = options.storage or options.runs_dir / "studies"
     if not known:
-        raise InputError(
-            f"there is no search in {options.storage or options.runs_dir / 'studies'}."
-        )
+        raise InputError(f"there is no search in {where}.")
     if options.name not in known:
-        where = options.storage or options.runs_dir / "studies"
         raise InputError(f"name={options.name}: not in {where}; {nearest(options.name, known)}.")
     url = storage_url(options.storage, options.runs_dir, options.name)
     out = options.out or study_folder(options.runs_dir, options.name)

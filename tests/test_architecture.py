@@ -78,6 +78,7 @@ OUTSIDE = {
         "rgbt.evaluation.profile",
         "rgbt.evaluation.profiled_network",
         "rgbt.runtime.group",
+        "rgbt.runtime.signals",
     }
     | {f"rgbt.{each}" for each in READING - {"data", "geometry"}},
     "analysis": {f"rgbt.{each}" for each in READING - {"geometry"}},

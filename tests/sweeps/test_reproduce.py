@@ -144,7 +144,7 @@ def test_options_of_execution_are_sweep_settings() -> None:
         "workers": 2,
         "gpus": (0, 1),
         "retry": "failed",
-        "wait": False,
+        "wait": True,
         "stop_jobs": True,
         "commands": Path("file"),
         "timeout_minutes": 3.0,

@@ -257,3 +257,18 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
     assert other_code_line([Outcome(Point("p", ()), "finished", results=(new,))]) == ""
     outcomes = [Outcome(Point("p", ()), "finished", results=(old, new))] * 2
     assert other_code_line(outcomes).startswith("1 of 2 runs")
+
+
+def test_commands_are_written_to_regular_files_alone(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    refused = {
+        "link": {"commands": str(tmp_path / "link")},
+        "no/such": {"commands": str(tmp_path / "no" / "such" / "lines")},
+        "dry_run": {"commands": str(tmp_path / "lines"), "dry_run": True},
+    }
+    (tmp_path / "no").write_text("a file")
+    for words in refused.values():
+        desk = ListDesk(tmp_path, 1, **words)
+        with pytest.raises(InputError, match="commands"):
+            commands_line(desk.points, desk.settings)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "no"]

@@ -215,3 +215,15 @@ def test_a_search_of_one_worker_is_known_by_its_seed(tmp_path: Path) -> None:
 
 
 RECORDED = {0: (2.3731, 6, "b"), 12: (1.7039, 5, "b"), 19: (0.6025, 6, "b")}
+
+
+def test_a_search_by_hours_ends_when_all_points_are_tried(tmp_path: Path) -> None:
+    space = {
+        "x": {"type": "categorical", "choices": [1, 2]},
+        "y": {"type": "int", "low": 1, "high": 2},
+    }
+    desk = SearchDesk(tmp_path, space=space, hours=1.0).run()
+    assert {(trial.params["x"], trial.params["y"]) for trial in desk.trials} == {
+        *((1, 1), (1, 2), (2, 1), (2, 2)),
+    }
+    assert len(desk.executor.calls) == 4
