@@ -108,9 +108,8 @@ class SubmititExecutor:
             with suppress(RunError):  # a controller that is busy
                 self._ask()
         state = self._states.get(job, "ended")
-        if state in ("queued", "running", "ended") or job not in self._jobs:
-            return state
-        return f"{state}; see {self._jobs[job].paths.stderr}"
+        is_known = state == "failed" and job in self._jobs
+        return f"failed; see {self._jobs[job].paths.stderr}" if is_known else state
 
     def _ask(self) -> None:
         self._asked_at = time.monotonic()

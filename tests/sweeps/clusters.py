@@ -23,7 +23,8 @@ START_S = 60.0
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun")
 CORES = 8
 
-# No root, no cgroups, no accounting: everything is below one folder, and listens on loopback.
+# No root, no cgroups, no accounting: everything is below one folder, and listens on loopback. A job
+# that is queued again waits until its credential has expired, which takes 120 s by default.
 CONFIGURATION = """\
 ClusterName=tests
 SlurmctldHost={host}(127.0.0.1)
@@ -32,7 +33,7 @@ SlurmdPort={ports[1]}
 SlurmUser={user}
 SlurmdUser={user}
 AuthType=auth/munge
-AuthInfo=socket={folder}/munge.socket
+AuthInfo=socket={folder}/munge.socket,cred_expire=15
 CredType=cred/munge
 StateSaveLocation={folder}/state
 SlurmdSpoolDir={folder}/spool

@@ -54,18 +54,6 @@ def unfinished() -> list[str]:
     return [job for job, state in queue().items() if state in ("PENDING", "RUNNING", "COMPLETING")]
 
 
-def release(job: str) -> None:
-    """Start a job now that is queued again, which SLURM does after two minutes."""
-
-    def starts() -> bool:
-        command = ["scontrol", "update", f"jobid={job}", "StartTime=now"]
-        subprocess.run(command, check=False, capture_output=True)
-        return queue()[job] == "RUNNING"
-
-    until(lambda: queue()[job] == "PENDING", "the job to be queued again", 0.1)
-    until(starts, "the job to start again", 4.0)  # each one delays it by seconds
-
-
 def test_jobs_that_are_queued_again_give_the_same_runs(sweep: Sweep, straight: Sweep) -> None:
     process = sweep.start()
     until(lambda: len(sweep.jobs()) == 4, "four jobs")
@@ -76,8 +64,6 @@ def test_jobs_that_are_queued_again_give_the_same_runs(sweep: Sweep, straight: S
     for seed, names in {"0": ["USR2"], "2": ["TERM", "USR2"]}.items():
         for name in names:  # near the end of its time, and for another job
             subprocess.run(["scancel", f"--signal={name}", jobs[seed]], check=True)
-    for seed in "02":
-        release(jobs[seed])
     assert sweep.end(process) == 0, sweep.text
     assert {queue()[job] for job in jobs.values()} == {"COMPLETED"}
     for seed in "0123":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import time
 from collections.abc import Iterator
@@ -65,16 +66,10 @@ def send(job: str, *signals: str) -> None:
         subprocess.run(["scancel", f"--signal={name}", job], check=True)
 
 
-def release(executor: SubmititExecutor, job: str) -> None:
-    """Start a job now that SLURM has queued again, which it does after two minutes."""
-
-    def starts() -> bool:
-        command = ["scontrol", "update", f"jobid={job}", "StartTime=now"]
-        subprocess.run(command, check=False, capture_output=True)
-        return executor.state(job) == "running"
-
+def restarted(executor: SubmititExecutor, job: str) -> None:
+    """Wait until a job has been queued again and has started."""
     until(lambda: executor.state(job) == "queued", "the job to be queued again", 0.1)
-    until(starts, "the job to start again", 4.0)  # each one delays it by seconds
+    until(lambda: executor.state(job) == "running", "the job to start again", 0.1)
 
 
 def end(executor: SubmititExecutor, *some: str) -> list[str]:
@@ -104,8 +99,6 @@ def test_several_points_are_one_array_and_one_is_queued_again(tmp_path: Path) ->
     send(names[2], "TERM")  # as before another job takes its node
     until(lambda: "exit code 143" in points[2].log.read_text(), "the command to save")
     send(names[2], "USR2")
-    for job in names[0], names[2]:
-        release(executor, job)
     until(lambda: begun(points[0]) == begun(points[2]) == 2, "both commands again")
     go(*points)
     assert end(executor, *names) == ["ended"] * 3
@@ -120,10 +113,12 @@ def test_time_limits_that_a_job_may_reach(tmp_path: Path) -> None:
     (job,) = executor.submit(points)
     until(lambda: begun(points[0]) == 1, "the command")
     send(job, "USR2")
-    release(executor, job)
+    restarted(executor, job)
     until(lambda: begun(points[0]) == 2, "the command")
     send(job, "USR2")
-    assert end(executor, job) == ["ended"]
+    (state,) = end(executor, job)
+    assert re.fullmatch(r"failed; see .*_log\.err", state)
+    assert "timed-out too many times" in Path(state.removeprefix("failed; see ")).read_text()
     reason = failure_reason(points[0].log, 0)
     assert reason == "Job not requeued because: timed-out too many times"
 
@@ -134,7 +129,7 @@ def test_signal_of_the_first_moment_queues_again(tmp_path: Path) -> None:
     (job,) = executor.submit(points)
     until(points[0].log.exists, "the job")
     send(job, "TERM", "USR2")
-    release(executor, job)
+    restarted(executor, job)
     go(*points)
     assert end(executor, job) == ["ended"]
     assert failure_reason(points[0].log, 0) == ""
