@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
@@ -168,7 +169,7 @@ def search(request: Search, settings: SweepSettings) -> None:
         raise InputError("a search needs hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both.")
     if settings.commands is not None:
         raise InputError("hydra.sweeper.commands is for grids, lists and tables: a search decides.")
-    build_sampler(settings.sampler), build_pruner(settings.pruner)
+    samplers = {"sampler": build_sampler(settings.sampler), "pruner": build_pruner(settings.pruner)}
     is_reported = len(settings.objectives) == 1 and settings.objectives[0].is_reported
     if settings.pruner is not None and not is_reported:
         raise InputError("hydra.sweeper.pruner needs one objective that is reported, as val/mIoU.")
@@ -189,14 +190,15 @@ def search(request: Search, settings: SweepSettings) -> None:
     dataset = probe(request, settings).dataset
     with driving(runs_dir, request.study) as is_ours:
         if is_ours:
-            _run_trials(request, settings, signature(request.identity, dataset))
+            _run_trials(request, settings, signature(request.identity, dataset), samplers)
 
 
-def _run_trials(request: Search, settings: SweepSettings, identity: str) -> None:
+def _run_trials(
+    request: Search, settings: SweepSettings, identity: str, samplers: Mapping[str, Any]
+) -> None:
     runs_dir = request.runs.runs_dir
     url = storage_url(settings.storage, runs_dir, request.study)
     attributes = {names.SIGNATURE: identity}
-    samplers = {"sampler": build_sampler(settings.sampler), "pruner": build_pruner(settings.pruner)}
     objectives = settings.objectives
     study = open_study(request.study, open_storage(url), objectives, attributes, **samplers)
     if names.COMMAND not in study.user_attrs:

@@ -114,7 +114,7 @@ def _execute(work: Work) -> None:
 
 
 def _command(words: Sequence[str], variables: Mapping[str, str], log: str) -> None:
-    end_with_parent(signal.SIGTERM)  # nobody would know of a run that goes on
+    end_with_parent(signal.SIGTERM)  # nobody would know of a run that continues
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(variables)

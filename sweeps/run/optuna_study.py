@@ -37,7 +37,7 @@ def study_folder(runs_dir: Path, name: str) -> Path:
 
 @contextmanager
 def driving(runs_dir: Path, name: str) -> Iterator[bool]:
-    """Whether this process drives the study, and nobody else; if not, who does is said."""
+    """Whether this process drives the study, and nobody else; if not, prints who does."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"study={name}: only letters, digits, spaces and _ - . : / are possible.")
     folder = study_folder(runs_dir, name)

@@ -93,15 +93,16 @@ class SearchSource:
     def _next_trial(self) -> Trial | None:
         if self._left:
             trial = self._left.pop(0)
-            for name, distribution in self._space.items():  # of a driver killed while it asked
+            for name, distribution in self._space.items():  # of a driver killed meanwhile
                 trial._suggest(name, distribution)
             return trial
         total, known = self._settings.trials, self._study.get_trials(deepcopy=False)
         if total is not None and sum(trial.state.name != "WAITING" for trial in known) >= total:
             return None
-        tried = {json.dumps(trial.params, sort_keys=True) for trial in known}
-        if total is None and len(tried) >= _number_of_points(self._space):
-            return None  # by hours, it would propose the same points again and again
+        if total is None:  # by hours, it would propose the same points again and again
+            tried = {json.dumps(trial.params, sort_keys=True) for trial in known}
+            if len(tried) >= _number_of_points(self._space):
+                return None
         return self._study.ask(dict(self._space))
 
     def _point(self, trial: Trial) -> Point:
