@@ -148,3 +148,13 @@ def resumed_at(text: str) -> list[int]:
 def saved_at(text: str) -> list[int]:
     """Steps at which commands were stopped, by their log."""
     return [int(step) for step in re.findall(r"SIGTERM at step (\d+), and the checkpoint", text)]
+
+
+def prune_a_trial(sweep: Sweep) -> None:
+    """A search of one long trial, which its pruner stops at the first evaluation."""
+    sweep.steps, sweep.varied = 400, "optimizer.lr=interval(1e-5,1e-4)"
+    pruner = "hydra.sweeper.pruner={_target_: optuna.pruners.ThresholdPruner, lower: 101}"
+    trials = ("hydra.sweeper.trials=1", "hydra.sweeper.workers=1", "trainer.eval_every=2")
+    process = sweep.start(*trials, pruner)
+    assert sweep.end(process) in (0, 1), sweep.text
+    assert re.search(r"pruned +#0 .*pruned at step 2", sweep.text), sweep.text

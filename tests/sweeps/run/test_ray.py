@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.sweeps import clusters
-from tests.sweeps.driven import ROOT, Sweep, check, resumed_at, saved_at, steps
+from tests.sweeps.driven import ROOT, Sweep, check, prune_a_trial, resumed_at, saved_at, steps
 from tests.waiting import until
 
 pytestmark = pytest.mark.slow
@@ -126,12 +125,7 @@ def test_jobs_go_on_without_a_driver(sweep: Sweep) -> None:
 
 
 def test_pruned_trial_saves_and_frees_its_gpu(sweep: Sweep) -> None:
-    sweep.steps, sweep.varied = 400, "optimizer.lr=interval(1e-5,1e-4)"
-    pruner = "hydra.sweeper.pruner={_target_: optuna.pruners.ThresholdPruner, lower: 101}"
-    trials = ("hydra.sweeper.trials=1", "hydra.sweeper.workers=1", "trainer.eval_every=2")
-    process = sweep.start(*trials, pruner)
-    assert sweep.end(process) in (0, 1), sweep.text
-    assert re.search(r"pruned +#0 .*pruned at step 2", sweep.text), sweep.text
+    prune_a_trial(sweep)
     (log,) = (sweep.runs / ".logs").glob("*.log")
     (folder,) = (path.parent for path in sweep.runs.glob("*/run.json"))
     assert saved_at(log.read_text()) == steps(folder)[-1:]

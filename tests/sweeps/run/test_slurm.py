@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.sweeps import clusters
-from tests.sweeps.driven import Sweep, check, resumed_at, saved_at, steps
+from tests.sweeps.driven import Sweep, check, prune_a_trial, resumed_at, saved_at, steps
 from tests.waiting import until
 
 pytestmark = pytest.mark.slow
@@ -113,12 +113,7 @@ def test_jobs_go_on_without_a_driver(short: Sweep) -> None:
 
 
 def test_pruned_trial_saves_and_frees_its_node(short: Sweep) -> None:
-    short.steps, short.varied = 400, "optimizer.lr=interval(1e-5,1e-4)"
-    pruner = "hydra.sweeper.pruner={_target_: optuna.pruners.ThresholdPruner, lower: 101}"
-    trials = ("hydra.sweeper.trials=1", "hydra.sweeper.workers=1", "trainer.eval_every=2")
-    process = short.start(*trials, pruner)
-    assert short.end(process) in (0, 1), short.text
-    assert re.search(r"pruned +#0 .*pruned at step 2", short.text), short.text
+    prune_a_trial(short)
     until(lambda: not unfinished(), "the end of the job")
     (folder,) = (path.parent for path in short.runs.glob("*/run.json"))
     (log,) = (short.runs / ".logs").glob("*.log")
