@@ -58,12 +58,15 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    "sweeps.run": {"sweeps.space"},
+    "sweeps.plan": {"sweeps.space"},
+    "sweeps.run": {"sweeps.space", "sweeps.plan"},
+    "sweeps.score": {"sweeps.plan", "sweeps.run"},
     "sweeps.space": set(),
-    "sweeps.report": {f"sweeps.{e}" for e in ("run", "table", "verdicts", "rendering")},
-    "sweeps.table": {"sweeps.run"},
-    "sweeps.verdicts": {"sweeps.table", "sweeps.run"},
-    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "run", "verdicts")},
+    "sweeps.verdicts": {f"sweeps.{room}" for room in ("plan", "run", "score")},
+    "sweeps.rendering": {f"sweeps.{room}" for room in ("plan", "run", "score", "verdicts")},
+    "sweeps.report": {
+        f"sweeps.{room}" for room in ("plan", "run", "score", "verdicts", "rendering")
+    },
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},

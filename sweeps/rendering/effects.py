@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable, number
-from sweeps.table.design import TESTED, TRAINED, Design
+from sweeps.plan.design import TESTED, TRAINED, Design
 from sweeps.verdicts.effects import MEAN, Effects
 
 if TYPE_CHECKING:

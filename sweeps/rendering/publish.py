@@ -20,7 +20,7 @@ from sweeps.rendering.figure import figure_of
 from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 from sweeps.run.point_list import estimated_seconds, other_code_line
 from sweeps.run.progress import duration
-from sweeps.table.cells import NO_VALUE
+from sweeps.score.cells import NO_VALUE
 from sweeps.verdicts.stored import TableResult
 
 if TYPE_CHECKING:

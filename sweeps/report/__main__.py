@@ -88,8 +88,8 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -
 
     from analysis.results import finished_runs
     from rgbt.config.options import readable_paths
+    from sweeps.plan.planner import Planner
     from sweeps.report import pages
-    from sweeps.run.planner import Planner
     from sweeps.verdicts.stored import FinishedRuns, TableResults, known_tables
 
     runs = finished_runs(runs_dir, archive)

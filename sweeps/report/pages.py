@@ -20,6 +20,7 @@ from rgbt.runs.folder import GROUP
 from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
+from sweeps.plan.request import TAG
 from sweeps.rendering.claims import (
     claim_grids,
     claim_lines,
@@ -31,8 +32,7 @@ from sweeps.rendering.claims import (
 from sweeps.rendering.publish import drawn_of, grid_of, grids_of
 from sweeps.rendering.table import MARKDOWN
 from sweeps.run.progress import duration
-from sweeps.table.efficiency import million_parameters
-from sweeps.table.request import TAG
+from sweeps.score.efficiency import million_parameters
 from sweeps.verdicts.stored import TableResult, TableResults
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from sweeps.plan.request import TableRequest
 from sweeps.point import Outcome, Point
-from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, contrasts_of
 
 # Seeds of every row before the claims are judged for the first time: with fewer, an interval that

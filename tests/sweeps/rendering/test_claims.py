@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from rgbt.terminal import rich_table
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Row
 from sweeps.rendering.claims import WORDS, claim_grids, claims_frame
-from sweeps.table.claim import Claim
-from sweeps.table.table import Row
 from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import table
 from tests.sweeps.verdicts.accuracies import planted

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from sweeps.table.claim import Claim
-from sweeps.table.table import Column, Row
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Column, Row
 from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, difference, printed_values
 from tests.sweeps.tabled import table
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
-from sweeps.table.cells import CellId, TableCell, score
-from sweeps.table.claim import Claim
-from sweeps.table.table import Column, Row, Table
+from sweeps.score.cells import CellId, TableCell, score
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, as_claimed
 from tests.sweeps.tabled import failed, outcome, table
 from tests.sweeps.verdicts.accuracies import accuracy, planted

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from analysis.uncertainty.verdicts import AnyTime
+from sweeps.plan.claim import Claim
+from sweeps.plan.request import TableRequest, seed_of
+from sweeps.plan.table import Row
 from sweeps.point import Outcome, Point
-from sweeps.table.claim import Claim
-from sweeps.table.request import TableRequest, seed_of
-from sweeps.table.table import Row
 from sweeps.verdicts.judge import TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from tests.sweeps.tabled import outcome, table
