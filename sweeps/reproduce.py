@@ -123,20 +123,18 @@ def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings
     """
     from rgbt.config.command import composing
     from rgbt.config.compose import compose_hydra
-    from sweeps.run.executors import check_launcher
-    from sweeps.settings import read_launcher, read_settings
+    from sweeps.settings import read_settings
 
     words = (*of_hydra, *readable_paths([f"runs_dir={options.runs_dir}"]), "hydra.job.name=rgbt")
     with composing(words):
         node = compose_hydra(["hydra/sweeper=study", *words])
-        launcher = read_launcher(node)
-    check_launcher(launcher)
     node.sweeper.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
         if key in node.sweeper:
             node.sweeper[key] = str(value) if isinstance(value, Path) else value
     try:
-        return read_settings(node.sweeper, launcher)
+        with composing(words):
+            return read_settings(node)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
 

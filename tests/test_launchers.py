@@ -58,7 +58,7 @@ def test_points_are_trained_in_jobs(launcher: str, data: Path, tmp_path: Path) -
     assert code == 0, err
     results = list(runs.glob("*/result.json"))
     assert len(results) == 2
-    jobs = {each.name for each in (runs / ".multirun" / ".submitit").glob("*/*_result.pkl")}
+    jobs = {path.name for path in (runs / ".multirun" / ".submitit").glob("*/*_result.pkl")}
     assert len(jobs) == 2
 
 

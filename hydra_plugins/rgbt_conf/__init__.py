@@ -69,7 +69,9 @@ class RgbtSearchPath(SearchPathPlugin):
         if compose is None:  # without its resolvers nobody can compose rgbt's files
             return
         elements = search_path.get_path()
-        for main in [each for each in elements if each.provider == "main" and each.path]:
+        for main in [
+            element for element in elements if element.provider == "main" and element.path
+        ]:
             path = main.path.removeprefix("file://")
             if Path(path).resolve() != compose.conf_dir().resolve():
                 continue

@@ -14,8 +14,7 @@ from rgbt.config.compose import compose, with_pixels
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
-from sweeps.plan.measurement import stored_at
-from sweeps.point import Point
+from sweeps.point import Outcome, Point, State
 
 
 @dataclass(frozen=True)
@@ -31,19 +30,21 @@ class PlannedPoint:
     runs: tuple[RunSpec, ...]
     fingerprints: Mapping[str, str]
 
-    def is_evaluated(self, results: Sequence[RunResult]) -> bool:
-        """Whether there are runs, and all further evaluations of them."""
-        wanted = self.point.evaluations
-        return bool(results) and all(stored_at(one, each) for one in results for each in wanted)
+    def outcome(
+        self, state: State, reason: str = "", results: tuple[RunResult, ...] = ()
+    ) -> Outcome:
+        """Return the outcome of this point (`Outcome`)."""
+        return Outcome(self.point, state, reason, results, tuple(run.key for run in self.runs))
 
 
 def specify_run(overrides: Sequence[str], *, checked: bool = True) -> RunSpec:
-    """The specification of one run; InputError in the words of the command line.
+    """Return the specification of one run; InputError in the words of the command line.
 
     Without `checked`, no class that the settings name is imported, so that torch is not either.
     """
     with composing(overrides):
-        return (specify if checked else requested_run)(compose(overrides), overrides)
+        config = compose(overrides)
+        return specify(config, overrides) if checked else requested_run(config, overrides)
 
 
 class Planner:
@@ -66,7 +67,7 @@ class Planner:
         return PlannedPoint(replace(point, label=label), key, runs, fingerprints)
 
     def fingerprint(self, run: RunSpec) -> str:
-        """The fingerprint of the data set of a run; InputError for one without an image."""
+        """Return the fingerprint of the data set of a run; InputError for one without an image."""
         name = json.dumps(run.dataset.plain, sort_keys=True)
         if name not in self._fingerprints:
             dataset: Any = run.dataset.build()
@@ -77,18 +78,22 @@ class Planner:
         return self._fingerprints[name]
 
     def row_digest(self, overrides: tuple[str, ...]) -> str:
-        """The digest of the settings that `overrides` request; "" where they do not fit alone."""
+        """Return the digest of the settings of `overrides`; "" where they do not fit alone."""
         try:
             return settings_digest(self.specify((*self.base, *overrides), checked=False).plain)
         except InputError:
             return ""
 
     def specify(self, overrides: tuple[str, ...], *, checked: bool = True) -> RunSpec:
-        """The specification of one run (`specify_run`); seeds of the same run are composed once."""
+        """Return the specification of one run (`specify_run`).
+
+        Runs that differ in their last override alone, a seed, are composed once.
+        """
         *others, last = overrides
         seed = last.removeprefix("seed=")
         is_seed = seed != last and seed.isdecimal()
         same = tuple(others) if is_seed else overrides
         if same not in self._specified:
             self._specified[same] = specify_run(overrides, checked=checked)
-        return self._specified[same].with_seed(int(seed)) if is_seed else self._specified[same]
+        run = self._specified[same]
+        return run.with_seed(int(seed)) if is_seed else run

@@ -14,7 +14,7 @@ import pytest
 
 from rgbt.checks import RunError
 from sweeps.run import submitit_jobs as jobs
-from sweeps.run.job import Step, Work, failure_reason
+from sweeps.run.job import Work, failure_reason
 from sweeps.run.submitit_jobs import SubmititExecutor, SubmititJob
 from tests.sweeps import clusters
 from tests.waiting import until
@@ -39,26 +39,30 @@ def slurm_executor(folder: Path, **options: Any) -> SubmititExecutor:
     return SubmititExecutor("slurm", {**given, "cpus_per_task": 1, **options}, None)
 
 
-def works(folder: Path, count: int = 1, what: str = "train") -> list[Work]:
+def works(folder: Path, count: int = 1) -> list[Work]:
     """Points whose commands wait for a file "own.go" in their folders."""
     found = []
     for key in "abcd"[:count]:
         place = folder / key
         place.mkdir(exist_ok=True)
-        step = Step((STEPS, what, str(place / "own")), place)
-        found.append(Work(key, (step,), {}, folder / ".logs" / f"{key}.log", folder))
+        steps = {(STEPS, "train", str(place / "own")): place}
+        found.append(Work(key, steps, {}, folder / ".logs" / f"{key}.log", folder))
     return found
+
+
+def run_folder(work: Work) -> Path:
+    return work.folder / work.key
 
 
 def begun(work: Work) -> int:
     """How often its command has begun."""
-    file = work.steps[0].folder / "steps"
+    file = run_folder(work) / "steps"
     return len(file.read_text().splitlines()) if file.exists() else 0
 
 
 def go(*some: Work) -> None:
     for work in some:
-        (work.steps[0].folder / "own.go").touch()
+        (run_folder(work) / "own.go").touch()
 
 
 def send(job: str, *signals: str) -> None:
