@@ -16,7 +16,7 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.verdicts.judge import JudgedClaim
+    from sweeps.judge.judged_table import JudgedClaim
 
 ALL = "all"
 
@@ -45,7 +45,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import path_lines, print_rich, rich_table
-    from sweeps.rendering.claims import (
+    from sweeps.show.claims import (
         claim_grids,
         claims_frame,
         claims_markdown,
@@ -75,11 +75,11 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.progress import track
 
     from analysis.results import finished_runs
+    from sweeps.judge.stored_tables import FinishedRuns, TableResults
     from sweeps.run.planner import Planner
     from sweeps.table.request import TableRequest
     from sweeps.table.table import is_own, table_names
     from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
-    from sweeps.verdicts.stored import FinishedRuns, TableResults
 
     names = table_names(Path("none"))
     if options.table != ALL:

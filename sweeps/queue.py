@@ -18,6 +18,7 @@ from rgbt.checks import InputError, split_list
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
+from sweeps.judge.judged_table import contrasts_of
 from sweeps.point import Outcome, Point
 from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
@@ -27,7 +28,6 @@ from sweeps.space import signature
 from sweeps.table.request import TAG, seed_of
 from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
-from sweeps.verdicts.judge import contrasts_of
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options

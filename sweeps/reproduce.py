@@ -79,11 +79,11 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
+    from sweeps.judge.judged_table import rule_of
     from sweeps.queue import run_queue
-    from sweeps.rendering.publish import print_preview, publish_table
     from sweeps.run.point_list import commands_line, preview_points, run_points
+    from sweeps.show.publish import print_preview, publish_table
     from sweeps.table_plan import plan_table, stored_and_planner
-    from sweeps.verdicts.judge import rule_of
 
     of_hydra = [word for word in overrides if word.startswith(HYDRA)]
     overrides = [word for word in overrides if word not in of_hydra]

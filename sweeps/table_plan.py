@@ -14,6 +14,8 @@ from rgbt.config.command import composing
 from rgbt.config.component import Component
 from rgbt.config.compose import available, compose
 from rgbt.config.options import readable_paths
+from sweeps.judge.judged_table import CellRunId, TableJudge
+from sweeps.judge.until_decided import START, SeedsUntilDecided
 from sweeps.point import Outcome
 from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList
@@ -24,8 +26,6 @@ from sweeps.table.efficiency import network_sizes
 from sweeps.table.external import ExternalRow, ExternalRun, external_rows, row_named
 from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
 from sweeps.table.table import PUBLISHED, Row, Table, is_own, load_table, table_names, table_path
-from sweeps.verdicts.judge import CellRunId, TableJudge
-from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options

@@ -60,10 +60,9 @@ COMMAND = {"config", "data"}
 ROOMS = {
     "sweeps.run": {"sweeps.space"},
     "sweeps.space": set(),
-    "sweeps.report": {f"sweeps.{e}" for e in ("run", "table", "verdicts", "rendering")},
     "sweeps.table": {"sweeps.run"},
-    "sweeps.verdicts": {"sweeps.table", "sweeps.run"},
-    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "run", "verdicts")},
+    "sweeps.judge": {"sweeps.table", "sweeps.run"},
+    "sweeps.show": {f"sweeps.{room}" for room in ("table", "run", "judge")},
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},

@@ -23,12 +23,12 @@ from rgbt.runs.folder import RunFolder, read_description, read_result
 from rgbt.runs.result import RunResult
 from rgbt.tracking.sync import entry as sync
 from sweeps.claims import entry as claims
-from sweeps.report.__main__ import entry as report
+from sweeps.judge import stored
+from sweeps.report import entry as report
 from sweeps.reproduce import entry as reproduce
 from sweeps.run.optuna_study import open_storage, storage_url, study_folder
 from sweeps.study import entry as study
 from sweeps.table.request import REQUESTED, TAG
-from sweeps.verdicts import stored
 from tests.commands import Call, Trained, short
 from tests.measured import remeasured
 

@@ -15,7 +15,7 @@ from sweeps.run.planner import Planner
 from sweeps.table.request import UNTIL_DECIDED
 from tests.commands import Call, assert_one_sentence
 from tests.measured import remeasured
-from tests.sweeps.verdicts.accuracies import accuracy
+from tests.sweeps.judge.accuracies import accuracy
 
 TABLE = """\
 paper: my

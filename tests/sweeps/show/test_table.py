@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from rgbt.tables import TextTable
-from sweeps.rendering.table import (
+from sweeps.show.table import (
     COUNTED,
     MARKDOWN,
     NOT_PRINTED,

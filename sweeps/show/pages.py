@@ -20,7 +20,9 @@ from rgbt.runs.folder import GROUP
 from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
-from sweeps.rendering.claims import (
+from sweeps.judge.stored_tables import TableResult, TableResults
+from sweeps.run.progress import duration
+from sweeps.show.claims import (
     claim_grids,
     claim_lines,
     claims_frame,
@@ -28,12 +30,10 @@ from sweeps.rendering.claims import (
     counts_grid,
     statement,
 )
-from sweeps.rendering.publish import drawn_of, grid_of, grids_of
-from sweeps.rendering.table import MARKDOWN
-from sweeps.run.progress import duration
+from sweeps.show.publish import drawn_of, grid_of, grids_of
+from sweeps.show.table import MARKDOWN
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.request import TAG
-from sweeps.verdicts.stored import TableResult, TableResults
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from rgbt.metrics.counts import Counts
+from sweeps.judge.effects import MEAN, Effects, effects_of
+from sweeps.judge.judged_table import TableJudge
 from sweeps.table.cells import world_words
 from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
-from sweeps.verdicts.effects import MEAN, Effects, effects_of
-from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
