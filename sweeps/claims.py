@@ -16,7 +16,7 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.verdicts.judge import JudgedClaim
+    from sweeps.judge.judged_table import JudgedClaim
 
 ALL = "all"
 
@@ -45,7 +45,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import path_lines, print_rich, rich_table
-    from sweeps.rendering.claims import (
+    from sweeps.show.claims import (
         claim_grids,
         claims_frame,
         claims_markdown,
@@ -75,6 +75,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.progress import track
 
     from analysis.results import finished_runs
+    from sweeps.judge.stored_tables import FinishedRuns, TableResults
     from sweeps.plan.planner import Planner
     from sweeps.plan.request import (
         TableRequest,
@@ -84,7 +85,6 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
         read_named,
     )
     from sweeps.plan.table import is_own, table_names
-    from sweeps.verdicts.stored import FinishedRuns, TableResults
 
     names = table_names(Path("none"))
     if options.table != ALL:

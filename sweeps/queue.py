@@ -17,6 +17,8 @@ from rgbt.checks import InputError
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
+from sweeps.judge.judged_table import TableJudge, contrasts_of
+from sweeps.judge.until_decided import SeedsUntilDecided
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import TAG, TableRequest, seed_of
 from sweeps.point import Outcome, Point
@@ -24,8 +26,6 @@ from sweeps.run.point_list import PointList, commands_line, preview_points, run_
 from sweeps.run.run_store import RunStore
 from sweeps.settings import SweepSettings
 from sweeps.space import signature
-from sweeps.verdicts.judge import TableJudge, contrasts_of
-from sweeps.verdicts.until_decided import SeedsUntilDecided
 
 # Estimated duration of a run as long as no run of its network has finished: that of an arm at
 # bench scale on two cores.

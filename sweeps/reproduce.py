@@ -121,6 +121,7 @@ def request_of(options: Options, name: str, words: Sequence[str], planner: Plann
     InputError: an option or a word that does not fit the table, rows that would be one run, or
     seeds=until_decided of a table without claims.
     """
+    from sweeps.judge.until_decided import START
     from sweeps.plan.request import (
         TableRequest,
         check_equal_runs,
@@ -130,7 +131,6 @@ def request_of(options: Options, name: str, words: Sequence[str], planner: Plann
         seeds_of,
     )
     from sweeps.plan.table import is_own
-    from sweeps.verdicts.until_decided import START
 
     adds, both = options.seeds == "until_decided", options.form == "both"
     typed = TableRequest(
@@ -163,13 +163,13 @@ def reproduce_one(
 ) -> int:
     """Run what one table lacks, and publish it; 1 if a cell failed or has no value."""
     from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
-    from sweeps.rendering.publish import print_preview, publish_table
+    from sweeps.judge.judged_table import TableJudge, rule_of
+    from sweeps.judge.stored_tables import TableResult
+    from sweeps.judge.until_decided import SeedsUntilDecided
     from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
     from sweeps.score.efficiency import network_sizes
     from sweeps.score.external import evaluate_external
-    from sweeps.verdicts.judge import TableJudge, rule_of
-    from sweeps.verdicts.stored import TableResult
-    from sweeps.verdicts.until_decided import SeedsUntilDecided
+    from sweeps.show.publish import print_preview, publish_table
 
     request = request_of(options, options.table, words, planner)
     rule = AnyTime() if request.until_decided else FixedSeeds()

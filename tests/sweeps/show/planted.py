@@ -18,7 +18,7 @@ from sweeps.plan.request import TableRequest, make_request, row_digests
 from sweeps.plan.table import load_table
 from tests.analysis.counts import result_of
 from tests.measured import remeasured
-from tests.sweeps.verdicts.accuracies import accuracy
+from tests.sweeps.judge.accuracies import accuracy
 
 PROVENANCE = {
     "started": "2026-01-01T00:00:00+00:00",

@@ -13,15 +13,15 @@ from rich.text import Text
 from rgbt.files.atomic import write_atomic
 from rgbt.tables import ABSENT, TextTable
 from rgbt.terminal import info, path_lines, print_rich, rich_table
+from sweeps.judge.stored_tables import TableResult
 from sweeps.point import Outcome, State
-from sweeps.rendering.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
-from sweeps.rendering.effects import effects_figure, effects_grids
-from sweeps.rendering.figure import figure_of
-from sweeps.rendering.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 from sweeps.run.point_list import estimated_seconds, other_code_line
 from sweeps.run.progress import duration
 from sweeps.score.cells import NO_VALUE
-from sweeps.verdicts.stored import TableResult
+from sweeps.show.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
+from sweeps.show.effects import effects_figure, effects_grids
+from sweeps.show.figure import figure_of
+from sweeps.show.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
