@@ -25,7 +25,6 @@ from sweeps import attributes as names
 from sweeps import space as spaces
 from sweeps.plan.planner import Planner, specify_run
 from sweeps.point import Point, short_names
-from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.run import point_list
 from sweeps.run.driver import drive
 from sweeps.run.optuna_study import (
@@ -41,6 +40,7 @@ from sweeps.run.progress import ProgressView, duration
 from sweeps.run.run_store import RunStore, open_run_store
 from sweeps.run.search_source import SearchSource
 from sweeps.settings import SweepSettings, read_settings
+from sweeps.show.seed_groups import group_grid, unfinished_grid
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
 from sweeps.study import publish_study
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sweeps.report.__main__ import report_of
+from sweeps.report import report_of
 
 pytestmark = pytest.mark.docs
 

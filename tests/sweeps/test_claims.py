@@ -15,7 +15,7 @@ from sweeps.plan.request import UNTIL_DECIDED
 from sweeps.reproduce import entry as reproduce
 from tests.commands import Call, assert_one_sentence
 from tests.measured import remeasured
-from tests.sweeps.verdicts.accuracies import accuracy
+from tests.sweeps.judge.accuracies import accuracy
 
 TABLE = """\
 paper: my

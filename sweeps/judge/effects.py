@@ -14,9 +14,9 @@ from analysis.uncertainty.contrasts import Evidence, Term, combine
 from analysis.uncertainty.effects import Effect, Noise, estimate_effects
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT
+from sweeps.judge.judged_table import Cell, CellRunId, TableJudge
 from sweeps.plan.design import Design, sign_of
 from sweeps.point import Outcome
-from sweeps.verdicts.judge import Cell, CellRunId, TableJudge
 
 if TYPE_CHECKING:
     import pandas as pd

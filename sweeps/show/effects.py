@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable, number
+from sweeps.judge.effects import MEAN, Effects
 from sweeps.plan.design import TESTED, TRAINED, Design
-from sweeps.verdicts.effects import MEAN, Effects
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sweeps.rendering.figure import SHIFT, figure_of
+from sweeps.show.figure import SHIFT, figure_of
 from tests.sweeps.tabled import Made
 
 

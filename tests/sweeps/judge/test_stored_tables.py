@@ -9,11 +9,11 @@ import pytest
 
 from analysis.results import finished_runs
 from rgbt.runs.folder import RunFolder, read_description
+from sweeps.judge.stored_tables import FinishedRuns, TableResults, Variant
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import REQUESTED
 from sweeps.plan.table import Table, load_table
-from sweeps.verdicts.stored import FinishedRuns, TableResults, Variant
-from tests.sweeps.report.planted import plant
+from tests.sweeps.show.planted import plant
 
 NAME, WORDS = "crm/table3a", ("optimizer.lr=-1", "masker=crm")
 SHARES = {"RGB": (50.0,), "CRM": (60.0,)}

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from analysis.uncertainty.verdicts import AnyTime
+from sweeps.judge.judged_table import TableJudge
+from sweeps.judge.until_decided import START, SeedsUntilDecided
 from sweeps.plan.claim import Claim
 from sweeps.plan.request import TableRequest, seed_of
 from sweeps.plan.table import Row
 from sweeps.point import Outcome, Point
-from sweeps.verdicts.judge import TableJudge
-from sweeps.verdicts.until_decided import START, SeedsUntilDecided
+from tests.sweeps.judge.accuracies import accuracy
 from tests.sweeps.tabled import outcome, table
-from tests.sweeps.verdicts.accuracies import accuracy
 
 MEANS = {"ours": 80.0, "base": 60.0, "twin": 60.0, "other": 50.0}
 """Of two rows with one mean, neither is better."""

@@ -21,11 +21,11 @@ from analysis.archive import _compared, add
 from rgbt.checks import InputError
 from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.result import RunResult
-from sweeps.report.__main__ import entry, report_of
-from sweeps.report.pages import Report
+from sweeps.report import entry, report_of
+from sweeps.show.pages import Report
 from tests.commands import Call
 from tests.models.external.standins import STACKED, write_checkout
-from tests.sweeps.report.planted import plant
+from tests.sweeps.show.planted import plant
 
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
@@ -337,7 +337,7 @@ def test_empty_archive_says_so_with_the_command(tmp_path: Path) -> None:
 def test_command_writes_pages_fills_marks_and_removes_old_figures(
     call: Call, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sweeps.report.pages.million_parameters", lambda words: 1.0)
+    monkeypatch.setattr("sweeps.show.pages.million_parameters", lambda words: 1.0)
     out, page = tmp_path / "out", tmp_path / "README.md"
     out.mkdir()
     (out / "stale.svg").touch()
@@ -361,7 +361,7 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
 def test_report_needs_no_torch(place: Path, tmp_path: Path) -> None:
     code = (
         f"import sys; sys.argv = ['report', 'out={tmp_path}', 'resamples=200']\n"
-        "import sweeps.report.__main__ as m\n"
+        "import sweeps.report as m\n"
         "try: m.entry()\n"
         "except SystemExit as end: print(end.code, {'torch', 'mlflow'} & set(sys.modules))"
     )

@@ -20,8 +20,11 @@ from rgbt.runs.folder import GROUP
 from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
+from sweeps.judge.stored_tables import TableResult, TableResults
 from sweeps.plan.request import TAG
-from sweeps.rendering.claims import (
+from sweeps.run.progress import duration
+from sweeps.score.efficiency import million_parameters
+from sweeps.show.claims import (
     claim_grids,
     claim_lines,
     claims_frame,
@@ -29,11 +32,8 @@ from sweeps.rendering.claims import (
     counts_grid,
     statement,
 )
-from sweeps.rendering.publish import drawn_of, grid_of, grids_of
-from sweeps.rendering.table import MARKDOWN
-from sweeps.run.progress import duration
-from sweeps.score.efficiency import million_parameters
-from sweeps.verdicts.stored import TableResult, TableResults
+from sweeps.show.publish import drawn_of, grid_of, grids_of
+from sweeps.show.table import MARKDOWN
 
 if TYPE_CHECKING:
     import pandas as pd

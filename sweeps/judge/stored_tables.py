@@ -13,14 +13,8 @@ from rgbt.config.compose import available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
-from sweeps.plan.planner import Planner
-from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
-from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
-from sweeps.point import Outcome, Point
-from sweeps.score.cells import ScoredTable, score, size_marks
-from sweeps.score.efficiency import network_sizes
-from sweeps.verdicts.effects import Effects, effects_of
-from sweeps.verdicts.judge import (
+from sweeps.judge.effects import Effects, effects_of
+from sweeps.judge.judged_table import (
     RESAMPLES,
     CellRunId,
     JudgedClaim,
@@ -28,6 +22,12 @@ from sweeps.verdicts.judge import (
     TableJudge,
     rule_of,
 )
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
+from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
+from sweeps.point import Outcome, Point
+from sweeps.score.cells import ScoredTable, score, size_marks
+from sweeps.score.efficiency import network_sizes
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 

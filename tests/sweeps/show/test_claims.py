@@ -8,12 +8,12 @@ import pytest
 from rich.console import Console
 
 from rgbt.terminal import rich_table
+from sweeps.judge.judged_table import TableJudge
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Row
-from sweeps.rendering.claims import WORDS, claim_grids, claims_frame
-from sweeps.verdicts.judge import TableJudge
+from sweeps.show.claims import WORDS, claim_grids, claims_frame
+from tests.sweeps.judge.accuracies import planted
 from tests.sweeps.tabled import table
-from tests.sweeps.verdicts.accuracies import planted
 
 SAYS = "The network with both images is better than the one with the visible images alone."
 

@@ -10,9 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, contrasts_of
 from sweeps.plan.request import TableRequest
 from sweeps.point import Outcome, Point
-from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, contrasts_of
 
 # Seeds of every row before the claims are judged for the first time: with fewer, an interval that
 # is valid at any time is infinite.

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
+from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, as_claimed
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
 from sweeps.score.cells import CellId, TableCell, score
-from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, as_claimed
+from tests.sweeps.judge.accuracies import accuracy, planted
 from tests.sweeps.tabled import failed, outcome, table
-from tests.sweeps.verdicts.accuracies import accuracy, planted
 
 SHARES = {"low": (50.0, 51.0, 49.0), "high": (60.0, 61.5, 59.0), "same": (60.5, 60.0, 60.5)}
 """Accuracies in percent by seed."""

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from rgbt.metrics.counts import Counts
+from sweeps.judge.effects import MEAN, Effects, effects_of
+from sweeps.judge.judged_table import TableJudge
 from sweeps.plan.claim import Claim
 from sweeps.plan.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.plan.table import Column, Row, Table, world_words
-from sweeps.verdicts.effects import MEAN, Effects, effects_of
-from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()

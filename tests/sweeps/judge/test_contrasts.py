@@ -2,9 +2,15 @@ from __future__ import annotations
 
 import pytest
 
+from sweeps.judge.judged_table import (
+    Contrast,
+    base_scores,
+    contrasts_of,
+    difference,
+    printed_values,
+)
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Column, Row
-from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, difference, printed_values
 from tests.sweeps.tabled import table
 
 COLUMNS = (

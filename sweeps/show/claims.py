@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rgbt.tables import ABSENT, TextTable, csv_text
-from sweeps.rendering.table import plain
-from sweeps.verdicts.judge import JudgedClaim
+from sweeps.judge.judged_table import JudgedClaim
+from sweeps.show.table import plain
 
 if TYPE_CHECKING:
     import pandas as pd

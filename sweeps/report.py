@@ -16,7 +16,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.report.pages import Report
+    from sweeps.show.pages import Report
 
 # Remarks that are printed to stderr; the page has all.
 MAX_REMARKS = 5
@@ -88,9 +88,9 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -
 
     from analysis.results import finished_runs
     from rgbt.config.options import readable_paths
+    from sweeps.judge.stored_tables import FinishedRuns, TableResults, known_tables
     from sweeps.plan.planner import Planner
-    from sweeps.report import pages
-    from sweeps.verdicts.stored import FinishedRuns, TableResults, known_tables
+    from sweeps.show import pages
 
     runs = finished_runs(runs_dir, archive)
     planner = Planner(readable_paths([f"runs_dir={runs_dir}"]))

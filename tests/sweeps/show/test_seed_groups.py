@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome, Point
-from sweeps.rendering.seed_groups import group_grid, unfinished_grid
+from sweeps.show.seed_groups import group_grid, unfinished_grid
 from tests.sweeps.fakes import finish
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from rgbt.tables import TextTable
 from sweeps.plan.table import Column, Row
-from sweeps.rendering.table import (
+from sweeps.score.cells import ScoredTable, TableCell, score, size_marks
+from sweeps.show.table import (
     COUNTED,
     MARKDOWN,
     NOT_PRINTED,
@@ -20,7 +21,6 @@ from sweeps.rendering.table import (
     render_table,
     tidy_csv,
 )
-from sweeps.score.cells import ScoredTable, TableCell, score, size_marks
 from tests.sweeps.tabled import Made, failed, outcome, right, table
 
 MARKS = {("b", "acc"): 1, ("a_1", "acc"): 2}
