@@ -154,7 +154,7 @@ def test_options_of_execution_are_sweep_settings() -> None:
     words = ("hydra/launcher=ray", "hydra.launcher.num_gpus=0.25")
     found = settings_of(Options("my/small", **changes), words)
     assert vars(found).items() >= {**changes, "commands": "file"}.items()
-    assert (found.launcher.name, found.launcher.options["num_gpus"]) == ("ray", 0.25)
+    assert (found.launcher, found.launcher_options["num_gpus"]) == ("ray", 0.25)
 
 
 @pytest.mark.parametrize("word", ["hydra.sweeper.workers=2", "+hydra.launcher.key=1"])
