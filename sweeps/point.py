@@ -21,7 +21,7 @@ UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 
 @dataclass(frozen=True)
 class Point:
-    """One cell of a table, point of a grid or trial of a search.
+    """Describes one cell of a table, point of a grid or trial of a search.
 
     Attributes:
         label: as shown, e.g. "Ny/4 seed=1".
@@ -68,7 +68,7 @@ def varied_keys(points: Sequence[Point]) -> list[str]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A point with its state and its finished runs.
+    """Says how a point stands, with its finished runs.
 
     Attributes:
         state: "running" may be by another driver; "pruned" is only a trial of a search.

@@ -29,7 +29,7 @@ WORKING = ("basic", "submitit_local", "submitit_slurm", "ray")
 
 @dataclass(frozen=True)
 class Objective:
-    """One number that a search optimizes.
+    """Names one number that a search optimizes.
 
     `metric` is "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
     being those of `rgbt.metrics.names`; of two frames "val/TC/aligned" etc.

@@ -148,7 +148,7 @@ def _run_grid(points: PointList, settings: SweepSettings) -> None:
 
 @dataclass(frozen=True)
 class Search:
-    """A search to run.
+    """Describes a search to run.
 
     `fixed` are overrides that all trials share; `identity` is a signature of what must not change
     in a study, to which the data set is added.

@@ -19,7 +19,7 @@ from sweeps.point import Outcome, Point, State
 
 @dataclass(frozen=True)
 class PlannedPoint:
-    """A point with its runs: one, or one per seed.
+    """Holds a point with its runs: one, or one per seed.
 
     `key` identifies it in a study: the key of its run, or a hash of several or of further
     evaluations. `fingerprints`: key of a run -> fingerprint of its data set.

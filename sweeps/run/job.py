@@ -30,7 +30,7 @@ SAYS, STARTED, DONE = "rgbt job: ", "started", "done"
 
 @dataclass(frozen=True)
 class Work:
-    """A point as an executor gets it.
+    """Tells an executor what to do for a point.
 
     Attributes:
         key: of the point, unique in the folder of runs.
@@ -66,7 +66,7 @@ def start_python(work: Work, words: Sequence[str]) -> tuple[int, Callable[[], ob
 
 
 class Job:
-    """Executes a point; a callable without a state, which submitit and Ray pickle."""
+    """Executes the commands of a point; only its work is pickled, by submitit and Ray."""
 
     poll_s = 0.5
 
@@ -101,7 +101,7 @@ class Job:
             self._wait(self._pid)
 
     def check(self) -> None:
-        """Called again and again while a command runs."""
+        """Do nothing; it is called again and again while a command runs."""
 
     def _say(self, text: str) -> None:
         with self.work.log.open("ab+") as log:

@@ -32,7 +32,7 @@ GRACE_S, POLL_S = 20.0, 0.05
 
 
 class LocalExecutor:
-    """Jobs as processes of this machine, `slots` at a time; the n-th slot sees the n-th `gpus`."""
+    """Executes jobs on this machine, `slots` at a time; the n-th slot sees the n-th of `gpus`."""
 
     is_lasting = False
 

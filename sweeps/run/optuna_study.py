@@ -36,7 +36,7 @@ def study_folder(runs_dir: Path, name: str) -> Path:
 
 @contextmanager
 def driving(runs_dir: Path, name: str) -> Iterator[bool]:
-    """Whether this process drives the study, and nobody else; if not, prints who does."""
+    """Take the study for this process; yields whether it is free, and prints who drives it."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"study={name}: only letters, digits, spaces and _ - . : / are possible.")
     folder = study_folder(runs_dir, name)

@@ -30,7 +30,7 @@ from sweeps.settings import SweepSettings
 
 @dataclass(frozen=True)
 class PointList:
-    """A list of points, run as the study of that name.
+    """Describes a list of points, which is run as the study of that name.
 
     Attributes:
         title: shown above the progress.

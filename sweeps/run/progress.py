@@ -45,7 +45,7 @@ def bars() -> Progress:
 
 
 class ProgressView:
-    """The progress of a driver; use as a context manager."""
+    """Shows the progress of a driver; use as a context manager."""
 
     def __init__(self, title: str) -> None:
         self._title, self._bars = title, bars()

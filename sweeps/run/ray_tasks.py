@@ -34,7 +34,7 @@ OPTIONS: dict[str, Any] = {
 
 
 class Keeper:
-    """The actor: submits tasks and knows their states; a job is named by the log of its point.
+    """Submits tasks and knows their states, as an actor; a job is named by the log of its point.
 
     Ray ends the tasks of a process with that process, so that a driver cannot own them itself.
     """
@@ -72,7 +72,7 @@ class Keeper:
 
 
 class RayExecutor:
-    """Tasks of the Ray cluster at `address`, of one that runs here, or of a new one."""
+    """Executes jobs on the Ray cluster at `address`, on one that runs here, or on a new one."""
 
     def __init__(self, options: Mapping[str, Any], workers: int | None) -> None:
         for name, value in options.items():
@@ -121,7 +121,7 @@ class RayExecutor:
 
 
 def _connect(address: str | None) -> bool:
-    """Whether there is a cluster; if none runs, and none is named, Ray is started here."""
+    """Connect to Ray, and start it if none runs or is named; whether it continues without us."""
     answer = signal.getsignal(signal.SIGTERM)
     try:
         return _init(address)

@@ -31,7 +31,7 @@ def read_metrics(run_folder: Path) -> list[MetricLine]:
 
 @dataclass(eq=False)
 class RunningPoint:
-    """A point and its job.
+    """Follows a point whose job an executor has.
 
     Attributes:
         job: its name at the executor.
@@ -61,7 +61,7 @@ class RunningPoint:
 
     @property
     def seconds(self) -> float:
-        """That its job has run; or has waited, as long as it has not run."""
+        """How long its job has run; or has waited, as long as it has not run."""
         now = 0.0 if self._ran and not self.is_started else time.monotonic() - self._began
         return self._ran + now
 

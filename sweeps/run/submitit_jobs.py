@@ -48,7 +48,7 @@ RUNNING = ("RUNNING", "COMPLETING", "SUSPENDED", "STOPPED", "SIGNALING", "STAGE_
 
 
 class SubmititJob(Job):
-    """A job that a file stops, and that is queued again near its time limit."""
+    """Executes a job until a file stops it, and is queued again near its time limit."""
 
     def __call__(self) -> int:
         """See `Job`."""
@@ -68,7 +68,7 @@ class SubmititJob(Job):
 
 
 class SubmititExecutor:
-    """Jobs of a cluster ("slurm"), or of this machine ("local")."""
+    """Executes jobs on a cluster ("slurm"), or on this machine ("local")."""
 
     def __init__(self, cluster: str, options: Mapping[str, Any], workers: int | None) -> None:
         self._cluster, self._executor = cluster, _executor(cluster, options)
@@ -159,8 +159,12 @@ def states_of_slurm() -> dict[str, str]:
         timeout=60,
         env=environment,
     ).stdout
-    found = dict(line.strip().split("|") for line in text.splitlines() if "|" in line)
-    return {job: _word(state) for job, state in found.items()}
+    states = {}
+    for line in text.splitlines():
+        if "|" in line:
+            job, state = line.strip().split("|")
+            states[job] = _word(state)
+    return states
 
 
 def _word(state: str) -> str:
