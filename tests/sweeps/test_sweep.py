@@ -21,7 +21,6 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
-from sweeps import settings as settings_of_sweeps
 from sweeps.point import Outcome, Point
 from sweeps.run import point_list
 from sweeps.run.optuna_study import driving, known_studies
@@ -162,14 +161,6 @@ def test_a_grid_that_another_process_drives_ends_quietly(
     said = capsys.readouterr()
     assert "study mine is driven by process" in said.err
     assert not said.out
-
-
-def test_a_launcher_without_its_package_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(settings_of_sweeps, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match="hydra/launcher=ray: it needs pip install"):
-        call(tmp_path, *GRID, "hydra/launcher=ray")
 
 
 def sigma(low: float, high: float) -> Any:

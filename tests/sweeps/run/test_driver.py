@@ -265,14 +265,3 @@ def test_a_storage_that_was_away_gets_what_it_missed(
     monkeypatch.setattr(desk.study, "tell", tell)
     again = SearchDesk(tmp_path, storage=desk.storage, objectives=UP, trials=1).run()
     assert (again.states(), again.executor.calls) == (["COMPLETE"], [])
-
-
-def test_a_trial_whose_job_failed_without_a_driver_is_recorded(tmp_path: Path) -> None:
-    cluster = lasting(fail)
-    cluster.is_full = True
-    desk = SearchDesk(tmp_path, executor=cluster, trials=1, wait=False).run()
-    while cluster.jobs["0"].look() == "running":
-        pass
-    later = SearchDesk(tmp_path, executor=cluster, trials=1, wait=False, storage=desk.storage)
-    assert (later.run().states(), len(cluster.submits)) == (["FAIL"], 1)
-    assert later.trials[0].user_attrs[names.REASON] == "ValueError: a bad day"

@@ -185,6 +185,7 @@ def test_a_trial_that_failed_without_a_driver_is_not_run_again(tmp_path: Path) -
     ListDesk(tmp_path, [desk.next().point], fail).run()
     again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
     assert (again.states(), again.executor.submits) == (["FAIL"], [])
+    assert again.trials[0].user_attrs[names.REASON] == "ValueError: a bad day"
 
 
 SPACE = {

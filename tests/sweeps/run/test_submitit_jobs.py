@@ -139,17 +139,6 @@ def test_signal_of_the_first_moment_queues_again(tmp_path: Path) -> None:
     assert failure_reason(points[0].log, 0) == ""
 
 
-def test_cancelled_by_the_user(tmp_path: Path) -> None:
-    executor, points = slurm_executor(tmp_path), works(tmp_path, 2)
-    names = executor.submit(points)
-    until(lambda: all(map(begun, points)), "the commands")
-    subprocess.run(["scancel", names[0]], check=True)
-    assert end(executor, names[0]) == ["cancelled"]
-    go(points[1])
-    assert end(executor, names[1]) == ["ended"]
-    assert failure_reason(points[1].log, 0) == ""
-
-
 def test_cancel_saves_what_runs_and_removes_what_waits(tmp_path: Path) -> None:
     executor, points = slurm_executor(tmp_path, array_parallelism=1), works(tmp_path, 2)
     names = executor.submit(points)
