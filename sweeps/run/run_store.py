@@ -61,7 +61,7 @@ class RunStore:
         return None if self._is_outdated(result) else result
 
     def of_point(self, plan: PlannedPoint) -> tuple[RunResult, ...]:
-        """Return the runs of a point if all are finished (see `find`), evaluated or not; else ()."""
+        """Return the runs of a point if `find` has all of them, evaluated or not; else ()."""
         wanted = plan.point.evaluations
         results = []
         for run in plan.runs:
