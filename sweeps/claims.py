@@ -76,9 +76,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
 
     from analysis.results import finished_runs
     from sweeps.judge.stored_tables import FinishedRuns, TableResults
-    from sweeps.run.planner import Planner
-    from sweeps.table.request import TableRequest
-    from sweeps.table.table import is_own, table_names
+    from sweeps.plan.planner import Planner
+    from sweeps.plan.request import TableRequest
+    from sweeps.plan.table import is_own, table_names
     from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
 
     names = table_names(Path("none"))

@@ -10,7 +10,7 @@ from typing import Literal
 
 from rgbt.runs.folder import read_result
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import Words
+from sweeps.plan.measurement import Words
 
 Value = str | int | float | bool | None
 State = Literal["finished", "failed", "running", "waiting", "missing"]

@@ -19,14 +19,14 @@ from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps.judge.judged_table import contrasts_of
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import TAG, seed_of
+from sweeps.plan.table import study_names, table_names
 from sweeps.point import Outcome, Point
-from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
 from sweeps.run.run_store import RunStore
 from sweeps.settings import SweepSettings
 from sweeps.space import signature
-from sweeps.table.request import TAG, seed_of
-from sweeps.table.table import study_names, table_names
 from sweeps.table_plan import TablePlan, plan_table
 
 if TYPE_CHECKING:

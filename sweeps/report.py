@@ -89,7 +89,7 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -
     from analysis.results import finished_runs
     from rgbt.config.options import readable_paths
     from sweeps.judge.stored_tables import FinishedRuns, TableResults, known_tables
-    from sweeps.run.planner import Planner
+    from sweeps.plan.planner import Planner
     from sweeps.show import pages
 
     runs = finished_runs(runs_dir, archive)

@@ -22,6 +22,7 @@ from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps import attributes as names
 from sweeps import space as spaces
+from sweeps.plan.planner import Planner, specify_run
 from sweeps.point import Point, short_names
 from sweeps.run import point_list
 from sweeps.run.driver import drive
@@ -34,7 +35,6 @@ from sweeps.run.optuna_study import (
     storage_url,
     study_folder,
 )
-from sweeps.run.planner import Planner, specify_run
 from sweeps.run.point_list import PointList
 from sweeps.run.progress import ProgressView, duration
 from sweeps.run.run_store import RunStore, open_run_store

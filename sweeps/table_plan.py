@@ -16,16 +16,25 @@ from rgbt.config.compose import available, compose
 from rgbt.config.options import readable_paths
 from sweeps.judge.judged_table import CellRunId, TableJudge
 from sweeps.judge.until_decided import START, SeedsUntilDecided
+from sweeps.plan.claim import PREVIOUS
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import PRETRAINED, TableRequest, seeds_of
+from sweeps.plan.table import (
+    PUBLISHED,
+    Row,
+    Table,
+    is_counted,
+    is_own,
+    load_table,
+    metric_of,
+    table_names,
+    table_path,
+)
 from sweeps.point import Outcome
-from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore, open_run_store
-from sweeps.table.cells import is_counted, metric_of
-from sweeps.table.claim import PREVIOUS
-from sweeps.table.efficiency import network_sizes
-from sweeps.table.external import ExternalRow, ExternalRun, external_rows, row_named
-from sweeps.table.request import PRETRAINED, TableRequest, seeds_of
-from sweeps.table.table import PUBLISHED, Row, Table, is_own, load_table, table_names, table_path
+from sweeps.score.efficiency import network_sizes
+from sweeps.score.external import ExternalRow, ExternalRun, external_rows, row_named
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options

@@ -58,11 +58,12 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    "sweeps.run": {"sweeps.space"},
+    "sweeps.plan": {"sweeps.space"},
+    "sweeps.run": {"sweeps.space", "sweeps.plan"},
+    "sweeps.score": {"sweeps.plan", "sweeps.run"},
     "sweeps.space": set(),
-    "sweeps.table": {"sweeps.run"},
-    "sweeps.judge": {"sweeps.table", "sweeps.run"},
-    "sweeps.show": {f"sweeps.{room}" for room in ("table", "run", "judge")},
+    "sweeps.judge": {f"sweeps.{room}" for room in ("plan", "run", "score")},
+    "sweeps.show": {f"sweeps.{room}" for room in ("plan", "run", "score", "judge")},
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},

@@ -15,8 +15,8 @@ from analysis.uncertainty.effects import Effect, Noise, estimate_effects
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT
 from sweeps.judge.judged_table import Cell, CellRunId, TableJudge
+from sweeps.plan.design import Design, sign_of
 from sweeps.point import Outcome
-from sweeps.table.design import Design, sign_of
 
 if TYPE_CHECKING:
     import pandas as pd

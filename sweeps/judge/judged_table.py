@@ -22,21 +22,25 @@ from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import Words, counts_of, stored_at
-from sweeps.point import Outcome
-from sweeps.table.cells import (
-    CellId,
-    ScoredTable,
-    TableCell,
+from sweeps.plan.claim import HIGHER, LOWER, Claim
+from sweeps.plan.design import sign_of
+from sweeps.plan.measurement import Words, counts_of, stored_at
+from sweeps.plan.request import UNTIL_DECIDED
+from sweeps.plan.table import (
+    Column,
+    Row,
+    Table,
     is_counted,
     metric_of,
     words_of,
     world_words,
 )
-from sweeps.table.claim import HIGHER, LOWER, Claim
-from sweeps.table.design import sign_of
-from sweeps.table.request import UNTIL_DECIDED
-from sweeps.table.table import Column, Row, Table
+from sweeps.point import Outcome
+from sweeps.score.cells import (
+    CellId,
+    ScoredTable,
+    TableCell,
+)
 
 # Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000

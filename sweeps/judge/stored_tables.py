@@ -22,12 +22,12 @@ from sweeps.judge.judged_table import (
     TableJudge,
     rule_of,
 )
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
+from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
 from sweeps.point import Outcome, Point
-from sweeps.run.planner import Planner
-from sweeps.table.cells import ScoredTable, score, size_marks
-from sweeps.table.efficiency import network_sizes
-from sweeps.table.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
-from sweeps.table.table import RELEASED, Form, Table, load_table, study_names, table_names
+from sweeps.score.cells import ScoredTable, score, size_marks
+from sweeps.score.efficiency import network_sizes
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, contrasts_of
+from sweeps.plan.request import TableRequest
 from sweeps.point import Outcome, Point
-from sweeps.table.request import TableRequest
 
 # Seeds of every row before the claims are judged for the first time: with fewer, an interval that
 # is valid at any time is infinite.

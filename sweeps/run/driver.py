@@ -21,11 +21,11 @@ from rgbt.files.atomic import is_held
 from rgbt.files.plain_files import inside
 from rgbt.runs.naming import TAGS
 from rgbt.runtime.signals import deferred
-from sweeps.evaluation import command_of, stored_at
+from sweeps.plan.measurement import command_of, stored_at
+from sweeps.plan.planner import PlannedPoint
 from sweeps.run.executors import Executor, open_executor
 from sweeps.run.job import TRAINING, Step, Work, failed_before
 from sweeps.run.local import LocalExecutor
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.progress import ProgressView
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import End, RunningPoint, Task

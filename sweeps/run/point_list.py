@@ -16,11 +16,11 @@ from rgbt.files.atomic import check_writable, is_held, write_atomic
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
+from sweeps.plan.planner import PlannedPoint, Planner
 from sweeps.point import UNFINISHED, Outcome, Point, varied_keys
 from sweeps.run.driver import drive, log_of, work_of
 from sweeps.run.job import failed_before
 from sweeps.run.optuna_study import driving
-from sweeps.run.planner import PlannedPoint, Planner
 from sweeps.run.progress import ProgressView, bars
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import End, Task

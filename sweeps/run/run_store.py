@@ -18,8 +18,8 @@ from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tracker import Tracking
-from sweeps.evaluation import Words, stored_at
-from sweeps.run.planner import PlannedPoint
+from sweeps.plan.measurement import Words, stored_at
+from sweeps.plan.planner import PlannedPoint
 
 
 @dataclass

@@ -16,9 +16,9 @@ from rgbt.checks import RunError
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.result import RunResult
 from sweeps import attributes as names
+from sweeps.plan.planner import PlannedPoint
 from sweeps.run.executors import Executor
 from sweeps.run.job import LOST, SAYS, TOO_LONG, failure_reason
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.run_store import RunStore
 from sweeps.settings import Objective
 

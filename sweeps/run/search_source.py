@@ -14,9 +14,9 @@ from rgbt.metrics.names import in_percent
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
 from sweeps import attributes as names
+from sweeps.plan.planner import Planner
 from sweeps.point import Point
 from sweeps.run.optuna_study import values_of
-from sweeps.run.planner import Planner
 from sweeps.run.running_point import End, PruningCallback, Task
 from sweeps.settings import SweepSettings
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.effects import MEAN, Effects
-from sweeps.table.design import TESTED, TRAINED, Design
+from sweeps.plan.design import TESTED, TRAINED, Design
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.uncertainty.blocks import Values
-from sweeps.table.cells import ScoredTable, TableCell, published
-from sweeps.table.efficiency import SCALE
-from sweeps.table.table import Column
+from sweeps.plan.table import Column
+from sweeps.score.cells import ScoredTable, TableCell, published
+from sweeps.score.efficiency import SCALE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,7 +21,9 @@ from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.stored_tables import TableResult, TableResults
+from sweeps.plan.request import TAG
 from sweeps.run.progress import duration
+from sweeps.score.efficiency import million_parameters
 from sweeps.show.claims import (
     claim_grids,
     claim_lines,
@@ -32,8 +34,6 @@ from sweeps.show.claims import (
 )
 from sweeps.show.publish import drawn_of, grid_of, grids_of
 from sweeps.show.table import MARKDOWN
-from sweeps.table.efficiency import million_parameters
-from sweeps.table.request import TAG
 
 if TYPE_CHECKING:
     import pandas as pd

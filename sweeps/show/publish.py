@@ -17,11 +17,11 @@ from sweeps.judge.stored_tables import TableResult
 from sweeps.point import Outcome, State
 from sweeps.run.point_list import estimated_seconds, other_code_line
 from sweeps.run.progress import duration
+from sweeps.score.cells import NO_VALUE
 from sweeps.show.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
 from sweeps.show.effects import effects_figure, effects_grids
 from sweeps.show.figure import figure_of
 from sweeps.show.table import MARKDOWN, TERMINAL, Style, latex, render_table, tidy_csv
-from sweeps.table.cells import NO_VALUE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

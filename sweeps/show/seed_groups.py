@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import over_seeds
+from sweeps.score.cells import over_seeds
 
 MOST_REGIONS = 99
 

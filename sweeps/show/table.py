@@ -10,17 +10,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from rgbt.tables import ABSENT, TextTable, csv_text
-from sweeps.table.cells import (
+from sweeps.plan.table import Column, Form, Row, is_counted, metric_of
+from sweeps.score.cells import (
     NO_VALUE,
     ScoredTable,
     TableCell,
-    is_counted,
     is_of_runs,
-    metric_of,
     published,
 )
-from sweeps.table.efficiency import SCALE
-from sweeps.table.table import Column, Form, Row
+from sweeps.score.efficiency import SCALE
 
 DOUBTFUL = "The printed value does not agree with the others of its row."
 NOT_PRINTED = "Not in the paper."

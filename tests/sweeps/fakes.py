@@ -22,13 +22,13 @@ from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.evaluation import Words, measurement_of
+from sweeps.plan.measurement import Words, measurement_of
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run import driver as drivers
 from sweeps.run import point_list
 from sweeps.run.job import SAYS, STARTED, TRAINING, Work, how_ended
 from sweeps.run.optuna_study import open_study
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import RunningPoint

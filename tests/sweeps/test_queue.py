@@ -14,10 +14,10 @@ import pytest
 from analysis.archive import archived
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import queue as queues
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Point
 from sweeps.reproduce import Options, settings_of
 from sweeps.run import driver as drivers
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
     Behaviour,

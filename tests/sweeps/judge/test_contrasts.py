@@ -9,8 +9,8 @@ from sweeps.judge.judged_table import (
     difference,
     printed_values,
 )
-from sweeps.table.claim import Claim
-from sweeps.table.table import Column, Row
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Column, Row
 from tests.sweeps.tabled import table
 
 COLUMNS = (

@@ -10,10 +10,9 @@ import pytest
 from rgbt.metrics.counts import Counts
 from sweeps.judge.effects import MEAN, Effects, effects_of
 from sweeps.judge.judged_table import TableJudge
-from sweeps.table.cells import world_words
-from sweeps.table.claim import Claim
-from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
-from sweeps.table.table import Column, Row, Table
+from sweeps.plan.claim import Claim
+from sweeps.plan.design import Design, DesignFactor, DesignMethod, Part
+from sweeps.plan.table import Column, Row, Table, world_words
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()

@@ -10,10 +10,10 @@ import pytest
 
 from analysis.uncertainty.contrasts import FIXED
 from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, as_claimed
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
-from sweeps.table.cells import CellId, TableCell, score
-from sweeps.table.claim import Claim
-from sweeps.table.table import Column, Row, Table
+from sweeps.score.cells import CellId, TableCell, score
 from tests.sweeps.judge.accuracies import accuracy, planted
 from tests.sweeps.tabled import failed, outcome, table
 

@@ -10,9 +10,9 @@ import pytest
 from analysis.results import finished_runs
 from rgbt.runs.folder import RunFolder, read_description
 from sweeps.judge.stored_tables import FinishedRuns, TableResults, Variant
-from sweeps.run.planner import Planner
-from sweeps.table.request import REQUESTED
-from sweeps.table.table import Table, load_table
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import REQUESTED
+from sweeps.plan.table import Table, load_table
 from tests.sweeps.show.planted import plant
 
 NAME, WORDS = "crm/table3a", ("optimizer.lr=-1", "masker=crm")

@@ -13,10 +13,10 @@ import numpy as np
 from analysis.uncertainty.verdicts import AnyTime
 from sweeps.judge.judged_table import TableJudge
 from sweeps.judge.until_decided import START, SeedsUntilDecided
+from sweeps.plan.claim import Claim
+from sweeps.plan.request import TableRequest, seed_of
+from sweeps.plan.table import Row
 from sweeps.point import Outcome, Point
-from sweeps.table.claim import Claim
-from sweeps.table.request import TableRequest, seed_of
-from sweeps.table.table import Row
 from tests.sweeps.judge.accuracies import accuracy
 from tests.sweeps.tabled import outcome, table
 

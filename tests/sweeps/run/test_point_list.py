@@ -20,9 +20,9 @@ from rgbt.runs.naming import TAGS, VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run.optuna_study import study_folder
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.point_list import (
     commands_line,
     estimated_seconds,

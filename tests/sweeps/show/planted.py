@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
-from sweeps.run.planner import Planner
-from sweeps.table.request import TableRequest
-from sweeps.table.table import load_table
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import load_table
 from sweeps.table_plan import make_request, row_digests
 from tests.analysis.counts import result_of
 from tests.measured import remeasured

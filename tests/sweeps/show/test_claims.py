@@ -9,9 +9,9 @@ from rich.console import Console
 
 from rgbt.terminal import rich_table
 from sweeps.judge.judged_table import TableJudge
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Row
 from sweeps.show.claims import WORDS, claim_grids, claims_frame
-from sweeps.table.claim import Claim
-from sweeps.table.table import Row
 from tests.sweeps.judge.accuracies import planted
 from tests.sweeps.tabled import table
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from rgbt.tables import TextTable
+from sweeps.plan.table import Column, Row
+from sweeps.score.cells import ScoredTable, TableCell, score, size_marks
 from sweeps.show.table import (
     COUNTED,
     MARKDOWN,
@@ -19,8 +21,6 @@ from sweeps.show.table import (
     render_table,
     tidy_csv,
 )
-from sweeps.table.cells import ScoredTable, TableCell, score, size_marks
-from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, failed, outcome, right, table
 
 MARKS = {("b", "acc"): 1, ("a_1", "acc"): 2}

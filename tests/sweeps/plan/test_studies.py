@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sweeps.run.planner import Planner
-from sweeps.table.request import TableRequest
-from sweeps.table.table import load_table
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import load_table
 from sweeps.table_plan import make_request
 
 MISSING = "missing_image"

@@ -9,8 +9,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.runs.specify import specify
+from sweeps.plan.planner import Planner
 from sweeps.point import Point
-from sweeps.run.planner import Planner
 
 
 @pytest.fixture

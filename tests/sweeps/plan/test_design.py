@@ -11,10 +11,10 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.config.values import check_value
-from sweeps.evaluation import command_of
-from sweeps.table.design import Design, DesignFactor, DesignMethod, Part, cell_name
-from sweeps.table.request import TableRequest
-from sweeps.table.table import load_table
+from sweeps.plan.design import Design, DesignFactor, DesignMethod, Part, cell_name
+from sweeps.plan.measurement import command_of
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import load_table
 
 MEANS = {"low_means": "little", "high_means": "much"}
 FACTORS: list[dict[str, Any]] = [

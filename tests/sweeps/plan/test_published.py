@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from sweeps.judge.judged_table import as_claimed, contrasts_of, printed_values
-from sweeps.table.table import Row, load_table, table_names
+from sweeps.plan.table import Row, load_table, table_names
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"

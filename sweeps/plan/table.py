@@ -17,11 +17,11 @@ from rgbt.config.values import check_value
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
 from rgbt.metrics.measurement import Statistics
-from rgbt.metrics.named import PAIR_SCORES, parse
+from rgbt.metrics.named import PAIR_SCORES, details_of_metric, parse
 from rgbt.metrics.pairs import Protocol
-from sweeps.evaluation import Head
-from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
-from sweeps.table.design import Design
+from sweeps.plan.claim import OTHERS, PREVIOUS, Claim, Strict
+from sweeps.plan.design import Design
+from sweeps.plan.measurement import Head, Words
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"  # tables of the papers
 STUDIES = Path(__file__).resolve().parents[1] / "studies"  # our tables, which no paper has printed
@@ -48,7 +48,7 @@ class Column(Strict):
         minus: (a, b): column a minus column b.
         mean: of two or more other columns of the row, e.g. of day and night.
         efficiency: of the row's network, without any run: millions of "parameters" at scale=paper
-            (`sweeps.table.efficiency`), or the "speed" that the paper prints, which is shown alone.
+            (`sweeps.score.efficiency`), or the "speed" that the paper prints, which is shown alone.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: its protocol, see `rgbt.metrics.pairs`.
         head: of a network with a head per domain, the one that predicts.
@@ -345,6 +345,40 @@ class Table(Strict):
                 "use form=paper."
             )
         return replace(self, rows=tuple(rows), claims=tuple(claims))
+
+
+def metric_of(column: Column, row: Row) -> str:
+    """The column's metric with placeholders such as ``{class}`` filled from the row's settings."""
+    return str(column.metric).format_map(row.settings)
+
+
+def words_of(column: Column, table: Table) -> Words:
+    """The measurement that a column needs; (): the test that every run ends with."""
+    if column.frames is not None:
+        return (f"frames={column.frames}",)
+    given: dict[str, Any] = {
+        "modality": column.modality,
+        "regions": table.regions,
+        "head": column.head,
+        "corruption": column.corruption or "",
+        "severity": "" if column.severity is None else f"{column.severity:g}",
+        "batch_norm": column.batch_norm,
+        "batch_norm_splits": ",".join(column.batch_norm_splits),
+        "details": details_of_metric(str(column.metric)) or "",
+    }
+    usual = ("", "default", "as trained")
+    return tuple(f"{key}={value}" for key, value in given.items() if value not in usual)
+
+
+def world_words(table: Table, row: Row) -> dict[str, Words]:
+    """Name -> measurement of the row's network in every world of `Row.tested_in`."""
+    usual = words_of(Column(name=names.MIOU, metric=names.MIOU), table)
+    return {name: (*usual, *overrides) for name, overrides in row.tested_in.items()}
+
+
+def is_counted(column: Column) -> bool:
+    """Whether the column is a score of counts, not computed from other columns."""
+    return column.metric is not None
 
 
 def table_names(folder: Path = OWN) -> list[str]:

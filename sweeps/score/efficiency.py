@@ -10,8 +10,8 @@ from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from sweeps.table.cells import NO_VALUE, CellId, TableCell
-from sweeps.table.request import TableRequest
+from sweeps.plan.request import TableRequest
+from sweeps.score.cells import NO_VALUE, CellId, TableCell
 
 SCALE = "paper"  # scale of all networks
 NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")  # overrides that begin so

@@ -7,11 +7,11 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import available, compose
+from sweeps.plan.claim import Claim
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import TableRequest, seeds_of
+from sweeps.plan.table import Column, Row, load_table
 from sweeps.point import Outcome
-from sweeps.run.planner import Planner
-from sweeps.table.claim import Claim
-from sweeps.table.request import TableRequest, seeds_of
-from sweeps.table.table import Column, Row, load_table
 from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
 from tests.sweeps.tabled import table
 

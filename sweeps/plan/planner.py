@@ -14,7 +14,7 @@ from rgbt.config.compose import compose, with_pixels
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
-from sweeps.evaluation import stored_at
+from sweeps.plan.measurement import stored_at
 from sweeps.point import Point
 
 

@@ -17,9 +17,8 @@ from rgbt.config.options import types_of
 from rgbt.metrics.measurement import Measurement, settings_of
 from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.result import OWN, RunResult
-from sweeps.evaluation import Words, command_of, counts_of, measurement_of, stored_at
-from sweeps.table.cells import words_of
-from sweeps.table.table import Column
+from sweeps.plan.measurement import Words, command_of, counts_of, measurement_of, stored_at
+from sweeps.plan.table import Column, words_of
 from tests.commands import ON_CPU, Call, Trained, short
 from tests.measured import measurement
 from tests.sweeps.fakes import finish

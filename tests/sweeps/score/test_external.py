@@ -17,13 +17,13 @@ from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import counts_of, stored_at
+from sweeps.plan.measurement import counts_of, stored_at
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
-from sweeps.table import external
-from sweeps.table.cells import score
-from sweeps.table.external import ExternalRow, ExternalRun, content_hash, external_rows
-from sweeps.table.request import TableRequest
-from sweeps.table.table import Column, Row, Table
+from sweeps.score import external
+from sweeps.score.cells import score
+from sweeps.score.external import ExternalRow, ExternalRun, content_hash, external_rows
 from sweeps.table_plan import make_request
 from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
 from tests.conftest import pair

@@ -13,7 +13,7 @@ from pydantic import StringConstraints, model_validator
 
 from rgbt.checks import check_choice
 from rgbt.config.compose import available
-from sweeps.table.claim import Strict
+from sweeps.plan.claim import Strict
 
 Level = Literal["low", "high"]
 Levels = Mapping[str, Level]  # Letter of each factor -> its level

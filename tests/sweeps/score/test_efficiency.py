@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from sweeps.table.efficiency import network_sizes
-from sweeps.table.request import TableRequest
-from sweeps.table.table import Column, Row
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import Column, Row
+from sweeps.score.efficiency import network_sizes
 from tests.sweeps.tabled import table
 
 COLUMNS = (Column(name="size", efficiency="parameters"), Column(name="fps", efficiency="speed"))

@@ -12,10 +12,9 @@ from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from rgbt.runs.naming import MACHINE_OVERRIDES
 from rgbt.runs.specify import CHECKOUT
-from sweeps.evaluation import Words
+from sweeps.plan.measurement import Words
+from sweeps.plan.table import Form, Row, Table, is_counted, words_of, world_words
 from sweeps.point import Point
-from sweeps.table.cells import is_counted, words_of, world_words
-from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
     from sweeps.point import Outcome
@@ -43,7 +42,7 @@ class TableRequest:
         table: with the rows that are shown; see `sweeps.table_plan.select_rows`.
         extra: overrides that win over those of the rows.
         pretrained: files of initial weights by the name of the network.
-        evaluated: labels of rows that are evaluated and not trained (`sweeps.table.external`).
+        evaluated: labels of rows that are evaluated and not trained (`sweeps.score.external`).
         typed: further options that make it another table, as they were typed.
         until_decided: whether seeds are added until claims are decided, which runs record.
         digests: of the settings of the rows without `extra` and `pretrained`, by label.

@@ -30,12 +30,11 @@ from rgbt.metrics.pair_list import PAIR_LIST
 from rgbt.runs.provenance import code
 from rgbt.runs.result import OWN, RunResult
 from rgbt.terminal import info
-from sweeps.evaluation import Words, command_of, stored_at
+from sweeps.plan.measurement import Words, command_of, stored_at
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import Row, Table, is_counted, words_of
 from sweeps.point import Outcome, Point
 from sweeps.run.local import run_command
-from sweeps.table.cells import is_counted, words_of
-from sweeps.table.request import TableRequest
-from sweeps.table.table import Row, Table
 
 FOLDER = "external"  # inside the folder of runs
 NODE_FILE = "of_the_table"  # file of conf/dataset and conf/metric, for the commands

@@ -15,10 +15,10 @@ from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import flatten
 from rgbt.runs.run_spec import RunSpec
-from sweeps.run.planner import Planner, specify_run
-from sweeps.table.efficiency import million_parameters
-from sweeps.table.request import TableRequest
-from sweeps.table.table import Form, Row, Table, load_table, study_names, table_names
+from sweeps.plan.planner import Planner, specify_run
+from sweeps.plan.request import TableRequest
+from sweeps.plan.table import Form, Row, Table, load_table, study_names, table_names
+from sweeps.score.efficiency import million_parameters
 from sweeps.table_plan import check_equal_runs
 from tests.composed import specified
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from sweeps.table.table import STUDIES, Column, Row, Table, load_table
+from sweeps.plan.table import STUDIES, Column, Row, Table, load_table
 
 SMALL: dict[str, Any] = {
     "paper": "my",

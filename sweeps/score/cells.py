@@ -7,16 +7,14 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import details_of_metric, value
+from rgbt.metrics.named import value
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import Words, counts_of
+from sweeps.plan.measurement import Words, counts_of
+from sweeps.plan.table import Column, Form, Row, Table, is_counted, metric_of, words_of
 from sweeps.point import Outcome
-from sweeps.table.table import Column, Form, Row, Table
 
 NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
 NO_SEED = "-1"  # seed of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
@@ -44,40 +42,6 @@ class TableCell:
     reason: str = ""
     mark: str = ""
     keys: tuple[str, ...] = ()
-
-
-def metric_of(column: Column, row: Row) -> str:
-    """The column's metric with placeholders such as ``{class}`` filled from the row's settings."""
-    return str(column.metric).format_map(row.settings)
-
-
-def words_of(column: Column, table: Table) -> Words:
-    """The measurement that a column needs; (): the test that every run ends with."""
-    if column.frames is not None:
-        return (f"frames={column.frames}",)
-    given: dict[str, Any] = {
-        "modality": column.modality,
-        "regions": table.regions,
-        "head": column.head,
-        "corruption": column.corruption or "",
-        "severity": "" if column.severity is None else f"{column.severity:g}",
-        "batch_norm": column.batch_norm,
-        "batch_norm_splits": ",".join(column.batch_norm_splits),
-        "details": details_of_metric(str(column.metric)) or "",
-    }
-    usual = ("", "default", "as trained")
-    return tuple(f"{key}={value}" for key, value in given.items() if value not in usual)
-
-
-def world_words(table: Table, row: Row) -> dict[str, Words]:
-    """Name -> measurement of the row's network in every world of `Row.tested_in`."""
-    usual = words_of(Column(name=names.MIOU, metric=names.MIOU), table)
-    return {name: (*usual, *overrides) for name, overrides in row.tested_in.items()}
-
-
-def is_counted(column: Column) -> bool:
-    """Whether the column is a score of counts, not computed from other columns."""
-    return column.metric is not None
 
 
 def is_of_runs(column: Column) -> bool:

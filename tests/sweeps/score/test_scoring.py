@@ -11,9 +11,9 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import OWN
+from sweeps.plan.table import Column, Row
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
-from sweeps.table.table import Column, Row
+from sweeps.score.cells import ScoredTable, TableCell, published, score, size_marks
 from tests.measured import measurement, remeasured
 from tests.sweeps.tabled import FakeResult, Made, counts_of, failed, outcome, right, table
 
