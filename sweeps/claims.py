@@ -70,16 +70,21 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
-    """The claims of the requested tables, judged by the finished runs."""
+    """Judge the claims of the requested tables by the finished runs."""
     from rich.console import Console
     from rich.progress import track
 
     from analysis.results import finished_runs
     from sweeps.judge.stored_tables import FinishedRuns, TableResults
     from sweeps.plan.planner import Planner
-    from sweeps.plan.request import TableRequest
+    from sweeps.plan.request import (
+        TableRequest,
+        check_equal_runs,
+        check_override,
+        make_request,
+        read_named,
+    )
     from sweeps.plan.table import is_own, table_names
-    from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
 
     names = table_names(Path("none"))
     if options.table != ALL:
@@ -90,19 +95,19 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     source = TableResults(finished, planner, counted=True)
     judged: list[JudgedClaim] = []
-    for each in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(each)
+    for typed in track(names, "judging", console=Console(stderr=True), transient=True):
+        name, table = read_named(typed)
         if not table.claims:
             continue
-        request, external = make_request(
+        request = make_request(
             TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
         )
-        if external:
+        for row in request.external:
             raise InputError(
-                f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
+                f"{row.kind}.{row.label}: only finished runs are judged here; "
                 f"use rgbt reproduce table={name} for rows that are not trained."
             )
-        if overrides or is_own(each):  # a test checks the others
+        if overrides or is_own(typed):  # a test checks the others
             check_equal_runs(request, planner)
         judged += source.result(request, checked=bool(overrides)).claims
     return judged

@@ -58,10 +58,10 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    "sweeps.plan": {"sweeps.space"},
-    "sweeps.run": {"sweeps.space", "sweeps.plan"},
-    "sweeps.score": {"sweeps.plan", "sweeps.run"},
     "sweeps.space": set(),
+    "sweeps.plan": {"sweeps.space"},
+    "sweeps.run": {f"sweeps.{room}" for room in ("space", "plan")},
+    "sweeps.score": {f"sweeps.{room}" for room in ("plan", "run")},
     "sweeps.judge": {f"sweeps.{room}" for room in ("plan", "run", "score")},
     "sweeps.show": {f"sweeps.{room}" for room in ("plan", "run", "score", "judge")},
     "analysis.predictions": set(),

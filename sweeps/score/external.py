@@ -18,11 +18,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, nearest
+from analysis.uncertainty.contrasts import FIXED
+from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
-from rgbt.config.options import with_home
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import read_measurement
@@ -31,7 +31,7 @@ from rgbt.runs.provenance import code
 from rgbt.runs.result import OWN, RunResult
 from rgbt.terminal import info
 from sweeps.plan.measurement import Words, command_of, stored_at
-from sweeps.plan.request import TableRequest
+from sweeps.plan.request import ExternalRow, RowSeed, TableRequest, row_named
 from sweeps.plan.table import Row, Table, is_counted, words_of
 from sweeps.point import Outcome, Point
 from sweeps.run.local import run_command
@@ -48,51 +48,30 @@ NEEDS_PAIRS = (
 )
 
 
-@dataclass(frozen=True)
-class ExternalRow:
-    """A row whose counts are made from a file of weights, or a folder of predictions."""
+def evaluate_external(
+    request: TableRequest, base: Sequence[str], runs_dir: Path, trust: str
+) -> dict[RowSeed, Outcome]:
+    """Count the rows that are not trained, and return their outcomes.
 
-    label: str
-    kind: str  # "weights" or "predictions"
-    path: Path
-
-
-def row_named(word: str, table: Table) -> Row:
-    """The row with this label, or with this number from 1 on; InputError: there is none."""
-    rows = {str(number): row for number, row in enumerate(table.rows, start=1)}
-    rows |= {row.label: row for row in table.rows}
-    if word not in rows:
-        labels = [row.label for row in table.rows]
-        raise InputError(f"there is no row '{word}' in the table; {nearest(word, labels)}.")
-    return rows[word]
-
-
-def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow], list[str]]:
-    """The external rows in the order of the table, and all words that are not about them."""
-    found: dict[str, ExternalRow] = {}
-    others = []
-    for word in words:
-        kind, _, rest = word.partition(".")
-        if kind not in ("weights", "predictions"):
-            others.append(word)
-            continue
-        labels = [row.label for row in table.rows if rest.startswith(f"{row.label}=")]
-        name = max(labels, key=len, default=rest.partition("=")[0])  # a label may hold "="
-        row, path = row_named(name, table), Path(with_home(rest[len(name) + 1 :])).absolute()
-        if not (path.is_file() if kind == "weights" else path.is_dir() and rest[len(name) + 1 :]):
-            what = "file of weights" if kind == "weights" else "folder of label images"
-            raise InputError(f"'{word}': expected {kind}.ROW=PATH with the path of a {what}.")
-        if kind == "weights" and not row.network and row.experiment is None:
-            raise InputError(f"'{word}': the row has no network; give predictions.ROW=FOLDER.")
-        found[row.label] = ExternalRow(row.label, kind, path)
-    return [found[row.label] for row in table.rows if row.label in found], others
+    `base` are overrides that all runs have. InputError: a path that does not fit its row.
+    """
+    outcomes: dict[RowSeed, Outcome] = {}
+    for given in request.external:
+        outcome = ExternalRun.of(given, request, base, runs_dir).outcome(request.table, trust)
+        if outcome.state == "failed":
+            raise InputError(f"row '{given.label}': {outcome.reason}")
+        outcomes[given.label, FIXED] = outcome
+    return outcomes
 
 
 @dataclass(frozen=True)
 class ExternalRun:
-    """The evaluations of an external row: `arguments` of each command, `folder` of the counts.
+    """The evaluations of an external row.
 
-    Data set and regions are those of the row, or of the first row that can be run (`config`).
+    Attributes:
+        config: of the data set and regions: of the row, or of the first row that can be run.
+        arguments: of each command.
+        folder: of the counts.
     """
 
     given: ExternalRow
@@ -105,8 +84,10 @@ class ExternalRun:
     def of(
         cls, given: ExternalRow, request: TableRequest, base: Sequence[str], runs_dir: Path
     ) -> ExternalRun:
-        """Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that
-        of the row's experiment at the scale of the table.
+        """Name the commands of a row by all that its counts depend on, and write their nodes.
+
+        Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that of
+        the row's experiment at the scale of the table.
         """
         row = row_named(given.label, request.table)
         trained = row if row.experiment else next(iter(request.table.runnable_rows), row)
@@ -124,11 +105,12 @@ class ExternalRun:
             arguments = (*row.network, *arguments, *machine)
         elif given.kind == "weights":
             arguments = tuple(word for word in words if not word.startswith("model.weights="))
+        kept = [word for word in arguments if not word.startswith("dataset.root=")]
         description = {
             "content": content_hash(given.path),
             "dataset": [fingerprint, {**plain["dataset"], "root": None}],
             "metric": plain["metric"],
-            "evaluated": [given.kind, *(w for w in arguments if not w.startswith("dataset.root="))],
+            "evaluated": [given.kind, *kept],
         }
         text = json.dumps(description, sort_keys=True, indent=1)
         folder = runs_dir.absolute() / FOLDER / hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -141,16 +123,21 @@ class ExternalRun:
         return cls(given, row, config, arguments, folder)
 
     def outcome(self, table: Table, trust: str) -> Outcome:
-        """The outcome with all counts that columns of `table` need; missing ones are made.
+        """Make the counts that columns of `table` need and lack, and return the outcome.
 
-        "failed" if there are none; one that fails beside others is the reason of its columns alone.
+        It is "failed" if there are none. A measurement that fails beside others is the reason of
+        its columns alone.
         """
-        columns = filter(is_counted, table.columns_of(self.row))
-        needed = dict.fromkeys(words_of(column, table) for column in columns)
-        result, reasons = RunResult(self.folder), dict[Words, str]()
+        needed: dict[Words, None] = {}
+        for column in table.columns_of(self.row):
+            if is_counted(column):
+                needed[words_of(column, table)] = None
+        result = RunResult(self.folder)
+        reasons: dict[Words, str] = {}
         # Plain images first: other measurements of single frames are found by comparison with them.
-        first = [] if all(map(_of_frames, needed)) else [()]
-        for words in dict.fromkeys([*first, *needed]):
+        has_images = not all(_of_frames(words) for words in needed)
+        wanted: dict[Words, None] = {(): None} if has_images else {}
+        for words in wanted | needed:
             if () in reasons:  # nothing else can be made of it
                 reasons[words] = reasons[()]
             elif not self._has(result, words):
@@ -168,7 +155,7 @@ class ExternalRun:
         return path is not None and (self.folder / path).is_file()
 
     def _make(self, result: RunResult, words: Words, trust: str) -> str:
-        """Run the command that makes the counts of a measurement; why it failed, or ""."""
+        """Run the command that makes the counts of a measurement; return why it failed, or ""."""
         command, reason = self._command(words)
         if reason:
             return reason
@@ -194,7 +181,7 @@ class ExternalRun:
         return reason
 
     def _command(self, words: Words) -> tuple[Words, str]:
-        """The command of a measurement without its output, or the reason why there is none."""
+        """Return the command of a measurement without its output, or why there is none."""
         is_of_frames = _of_frames(words)
         is_cut = any(word.startswith("regions=") for word in words)
         regions = [] if is_cut else [f"metric={NODE_FILE}"]
@@ -214,7 +201,7 @@ class ExternalRun:
         return ("analysis.score", "resamples=0", f"regions={metric.regions}", *of_folder), ""
 
     def _metric(self, words: Words) -> Any:
-        """The node of the configuration that says how a measurement cuts images into regions."""
+        """Return the node that says how a measurement cuts images into regions."""
         names = [word.removeprefix("regions=") for word in words if word.startswith("regions=")]
         return compose([f"metric={names[0]}"]).metric if names else self.config.metric
 
@@ -224,11 +211,17 @@ def _of_frames(words: Words) -> bool:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 of a file, or of names and contents of the files in a folder that are not hidden."""
+    """Return the SHA-256 of a file, or of names and contents of a folder's files.
+
+    Hidden files, and those in hidden folders, do not count.
+    """
     if path.is_file():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    inside = ((each, each.relative_to(path)) for each in sorted(path.rglob("*")) if each.is_file())
-    shown = ((each, name) for each, name in inside if not any(p[0] == "." for p in name.parts))
-    lines = [f"{content_hash(each)} {name.as_posix()}\n" for each, name in shown]
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    lines = []
+    for file in sorted(path.rglob("*")):
+        name = file.relative_to(path)
+        is_hidden = any(part.startswith(".") for part in name.parts)
+        if file.is_file() and not is_hidden:
+            lines.append(f"{content_hash(file)} {name.as_posix()}\n")
     return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -26,20 +26,18 @@ from sweeps.show.table import MARKDOWN, TERMINAL, Style, latex, render_table, ti
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sweeps.table_plan import TablePlan
+    from sweeps.plan.request import TableRequest
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
 
 
-def publish_table(plan: TablePlan, outcomes: Sequence[Outcome], out: Path) -> int:
+def publish_table(result: TableResult, outcomes: Sequence[Outcome], out: Path) -> int:
     """Print the table and its claims, and write its files into `out`.
 
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs = {**plan.request.runs(outcomes), **plan.external}
-    result = TableResult(plan.request, runs, plan.judge)
     shown = grid_of(result, TERMINAL)
     claims = claims_frame(result.claims)
     effects = grids_of(result)
@@ -110,9 +108,8 @@ def _report_missing(result: TableResult, outcomes: Sequence[Outcome]) -> bool:
     return failed > 0 or any(cell.mark == NO_VALUE for cell in result.scored.cells.values())
 
 
-def print_preview(plan: TablePlan, outcomes: Sequence[Outcome], workers: int) -> None:
+def print_preview(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> None:
     """Print the runs of a table with their states, and what is left to do."""
-    request = plan.request
     if outcomes:
         cells = tuple(
             (

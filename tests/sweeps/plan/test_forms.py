@@ -16,10 +16,9 @@ from rgbt.config.component import build
 from rgbt.config.compose import flatten
 from rgbt.runs.run_spec import RunSpec
 from sweeps.plan.planner import Planner, specify_run
-from sweeps.plan.request import TableRequest
+from sweeps.plan.request import TableRequest, check_equal_runs
 from sweeps.plan.table import Form, Row, Table, load_table, study_names, table_names
 from sweeps.score.efficiency import million_parameters
-from sweeps.table_plan import check_equal_runs
 from tests.composed import specified
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}

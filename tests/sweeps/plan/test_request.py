@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,10 +10,18 @@ from rgbt.checks import InputError
 from rgbt.config.compose import available, compose
 from sweeps.plan.claim import Claim
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import TableRequest, seeds_of
+from sweeps.plan.request import (
+    ExternalRow,
+    TableRequest,
+    check_equal_runs,
+    external_rows,
+    make_request,
+    read_named,
+    seeds_of,
+    select_rows,
+)
 from sweeps.plan.table import Column, Row, load_table
 from sweeps.point import Outcome
-from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -96,8 +105,8 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
     )
     name, published = read_named("spatialseg/table7")
     words = TableRequest(name, published, "paper", (0,), given)
-    wanted, external = make_request(words)
-    assert external == []
+    wanted = make_request(words)
+    assert wanted.external == ()
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
     )
@@ -114,7 +123,7 @@ def test_form_and_rows_make_another_table() -> None:
     plain = TableRequest(name, published, "demo", (0,))
     released = replace(plain, form="released")
     chosen = ((plain, ""), (plain, "Ny/4,Ny/8"), (released, ""))
-    made = [make_request(each, rows)[0] for each, rows in chosen]
+    made = [make_request(request, rows) for request, rows in chosen]
     variants = [each.variant for each in made]
     assert variants[0] == "demo"
     assert variants[1].startswith("demo-")
@@ -127,7 +136,7 @@ def test_form_and_rows_make_another_table() -> None:
 def test_both_forms_are_compared_by_claims() -> None:
     name, published = read_named("spatialseg/table3")
     typed = TableRequest(name, published, "demo", (0,))
-    request, _ = make_request(typed, "Ny/4,Ny/8", both=True)
+    request = make_request(typed, "Ny/4,Ny/8", both=True)
     labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
     assert [row.label for row in request.table.rows] == labels
     words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
@@ -191,3 +200,39 @@ def test_undeclared_rows_of_one_run_are_refused() -> None:
         check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
     third = replace(third, same_as="b")
     check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
+
+
+NAMED = table(
+    (
+        *(Row(label="CMNeXt"), Row(label="MFNet", experiment="mfnet")),
+        Row(label="RTFNet", network=("model=rtfnet_tiny",)),
+        *(Row(label="sigma"), Row(label="sigma=H/4"), Row(label="2")),
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [("CMNeXt", "CMNeXt"), ("sigma=H/4", "sigma=H/4"), ("3", "RTFNet"), ("2", "2")],
+)
+def test_external_row_is_named_by_label_or_number(tmp_path: Path, name: str, label: str) -> None:
+    folder = tmp_path / "a=b"
+    folder.mkdir()
+    words = [f"predictions.{name}={folder}", "dataset=mfnet"]
+    assert external_rows(words, NAMED) == (
+        [ExternalRow(label, "predictions", folder)],
+        ["dataset=mfnet"],
+    )
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("predictions.cmnext={folder}", "predictions.9={folder}", "weights.MFNet={folder}"),
+        *("predictions.MFNet={folder}/x.png", "predictions.MFNet=", "weights.CMNeXt={folder}/w"),
+    ],
+)
+def test_wrong_external_word_is_refused(tmp_path: Path, word: str) -> None:
+    (tmp_path / "w").touch()
+    with pytest.raises(InputError, match="row|ROW"):
+        external_rows([word.format(folder=tmp_path)], NAMED)

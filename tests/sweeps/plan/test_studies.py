@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import TableRequest
+from sweeps.plan.request import TableRequest, make_request
 from sweeps.plan.table import load_table
-from sweeps.table_plan import make_request
 
 MISSING = "missing_image"
 
@@ -17,7 +16,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
     planner = Planner()
 
     def keys(name: str) -> dict[str, str]:
-        request, _ = make_request(TableRequest(name, load_table(name), "demo", (0,)))
+        request = make_request(TableRequest(name, load_table(name), "demo", (0,)))
         return {
             row.label: planner.specify(request.overrides(row.label, 0)).key
             for row in request.trained_rows
@@ -30,7 +29,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
         "Masks": ablation["(2)"],
         "CRM": ablation["Ours"],
     }
-    request, _ = make_request(TableRequest(MISSING, load_table(MISSING), "demo", (0,)))
+    request = make_request(TableRequest(MISSING, load_table(MISSING), "demo", (0,)))
     assert request.evaluations() == (("corruption=removed:rgb",), ("corruption=removed:thermal",))
 
 
@@ -39,7 +38,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
 def test_self_training_is_compared_at_equal_steps_and_start(task: str) -> None:
     """All second stages of one head start from one run, the source alone among them."""
     name = f"self_training_{task}"
-    request, _ = make_request(TableRequest(name, load_table(name), "bench", (0,)))
+    request = make_request(TableRequest(name, load_table(name), "bench", (0,)))
     planner = Planner()
     specs = {
         row.label: planner.specify(request.overrides(row.label, 0)) for row in request.trained_rows

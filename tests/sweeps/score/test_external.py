@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 from analysis import score as score_command
+from analysis.uncertainty.contrasts import FIXED
 from rgbt import consistency, evaluate, predict
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
 from sweeps.plan.measurement import counts_of, stored_at
-from sweeps.plan.request import TableRequest
+from sweeps.plan.request import TableRequest, make_request
 from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
 from sweeps.score import external
 from sweeps.score.cells import score
-from sweeps.score.external import ExternalRow, ExternalRun, content_hash, external_rows
-from sweeps.table_plan import make_request
+from sweeps.score.external import content_hash, evaluate_external
 from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
 from tests.conftest import pair
 from tests.sweeps.tabled import table as table_of
@@ -44,36 +44,8 @@ ROWS = (
     Row(label="CMNeXt"),
     Row(label="MFNet", experiment="mfnet", overrides=ONE[1:]),
     Row(label="RTFNet", network=("model=rtfnet_tiny",)),
-    *(Row(label="sigma"), Row(label="sigma=H/4"), Row(label="2")),
 )
 TABLE = table_of(ROWS, COLUMNS)
-
-
-@pytest.mark.parametrize(
-    ("name", "label"),
-    [("CMNeXt", "CMNeXt"), ("sigma=H/4", "sigma=H/4"), ("3", "RTFNet"), ("2", "2")],
-)
-def test_external_row_is_named_by_label_or_number(tmp_path: Path, name: str, label: str) -> None:
-    folder = tmp_path / "a=b"
-    folder.mkdir()
-    words = [f"predictions.{name}={folder}", "dataset=mfnet"]
-    assert external_rows(words, TABLE) == (
-        [ExternalRow(label, "predictions", folder)],
-        ["dataset=mfnet"],
-    )
-
-
-@pytest.mark.parametrize(
-    "word",
-    [
-        *("predictions.cmnext={folder}", "predictions.9={folder}", "weights.MFNet={folder}"),
-        *("predictions.MFNet={folder}/x.png", "predictions.MFNet=", "weights.CMNeXt={folder}/w"),
-    ],
-)
-def test_wrong_external_word_is_refused(tmp_path: Path, word: str) -> None:
-    (tmp_path / "w").touch()
-    with pytest.raises(InputError, match="row|ROW"):
-        external_rows([word.format(folder=tmp_path)], TABLE)
 
 
 def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
@@ -128,12 +100,10 @@ def runs_of(data: Path, tmp_path: Path) -> Runs:
     def run(*words: str, table: Table = TABLE, trust: str = "") -> dict[str, Outcome]:
         place = ("dataset=mfnet", f"dataset.root={data}", "data.num_workers=0")
         every = (*place, *SMALL, *words)
-        request, rows = make_request(TableRequest("my/t", table, "demo", (0,), every))
-        base, runs_dir = ("tracking=none",), tmp_path / "runs"
-        return {
-            row.label: ExternalRun.of(row, request, base, runs_dir).outcome(table, trust)
-            for row in rows
-        }
+        request = make_request(TableRequest("my/t", table, "demo", (0,), every))
+        made = evaluate_external(request, ("tracking=none",), tmp_path / "runs", trust)
+        assert {seed for _, seed in made} == {FIXED}
+        return {label: outcome for (label, _), outcome in made.items()}
 
     return run
 
@@ -201,7 +171,7 @@ def test_predictions_of_exported_pairs_have_a_consistency(
     (found,) = runs_of(f"predictions.CMNeXt={folder}")["CMNeXt"].results
     (network,) = runs_of(f"weights.MFNet={run / 'best.pt'}")["MFNet"].results
     for words in ((), ("frames=aligned",)):
-        mine, theirs = (counts_of(each, words).counts for each in (found, network))
+        mine, theirs = (counts_of(result, words).counts for result in (found, network))
         assert np.array_equal(mine, theirs)
 
 
@@ -240,6 +210,6 @@ def test_interrupted_call_leaves_no_counts(
 def test_weights_of_another_network_fail_once(
     trained: Trained, commands: Commands, runs_of: Runs
 ) -> None:
-    run = runs_of(f"weights.RTFNet={trained(*ONE) / 'best.pt'}")["RTFNet"]
-    assert (run.state, len(commands)) == ("failed", 1)
-    assert "does not fit this network" in run.reason
+    with pytest.raises(InputError, match="row 'RTFNet': .*does not fit this network"):
+        runs_of(f"weights.RTFNet={trained(*ONE) / 'best.pt'}")
+    assert len(commands) == 1
