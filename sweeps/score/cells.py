@@ -141,7 +141,7 @@ class ScoredTable:
         commits: git commit -> number of runs made by it.
         lists: label of a row that was run -> the lists of its runs, in words.
         marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
-            `sweeps.judge.judged_table.TableJudge.marks`.
+            `sweeps.judge.judged_table.JudgedTable`.
     """
 
     name: str
