@@ -29,6 +29,13 @@ class Strict:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
 
+def check_different(names: Sequence[str]) -> None:
+    """Refuse names of which one is used twice."""
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise ValueError(f"'{name}' is used twice.")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Claim(Strict):
     """One statement of a paper about its own table.
@@ -77,7 +84,10 @@ class Claim(Strict):
         return (self.at_least, most) if self.expected == "higher" else (-most, -self.at_least)
 
     def pairs(self, labels: Sequence[str]) -> Iterator[tuple[str, str | None]]:
-        """(row, row that is subtracted or None) of a column; `labels` are what `OTHERS` means."""
+        """Yield rows of a column with the rows that are subtracted from them, or None.
+
+        `labels` are the rows that `OTHERS` means.
+        """
         if self.against == (PREVIOUS,):
             yield from zip(self.rows[1:], self.rows[:-1], strict=True)
             return
@@ -85,7 +95,9 @@ class Claim(Strict):
         for row in self.rows:
             if not against:
                 yield row, None
-            yield from ((row, other) for other in against if other != row)
+            for other in against:
+                if other != row:
+                    yield row, other
 
     @model_validator(mode="after")
     def _check(self) -> Claim:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain, combinations, product
+from itertools import combinations, product
 from math import prod
 from typing import Annotated, Any, Literal
 
@@ -13,10 +13,10 @@ from pydantic import StringConstraints, model_validator
 
 from rgbt.checks import check_choice
 from rgbt.config.compose import available
-from sweeps.plan.claim import Strict
+from sweeps.plan.claim import Strict, check_different
 
 Level = Literal["low", "high"]
-Levels = Mapping[str, Level]  # Letter of each factor -> its level
+Levels = Mapping[str, Level]  # letter of a factor -> its level
 
 Effect = str  # letters of the factors: "N" a main effect, "ON" an interaction
 
@@ -96,16 +96,16 @@ class Design(Strict):
         return {name: part for name, part in parts.items() if part is not None}
 
     def places(self, name: str, method: str) -> list[tuple[str, str]]:
-        """Label of the row, and name of the world its network is tested in, of every cell."""
-        cells = map(cell_name, self.cells(name))
-        return [
-            (f"{method} natural", c) if name == TESTED else (f"{method} {c}", "") for c in cells
-        ]
+        """Return the label of the row, and the world its network is tested in, of every cell."""
+        cells = [cell_name(cell) for cell in self.cells(name)]
+        if name == TESTED:
+            return [(f"{method} natural", cell) for cell in cells]
+        return [(f"{method} {cell}", "") for cell in cells]
 
     def cells(self, name: str) -> tuple[Levels, ...]:
-        """Levels of every cell of a part; the first factor changes most slowly."""
+        """Return the levels of every cell of a part; the first factor changes most slowly."""
         part = self.parts[name]
-        free = [letter for letter in self.letters if letter not in part.generators]
+        free = self._free_letters(part)
         words: tuple[Level, ...] = ("low", "high")
         cells = []
         for chosen in product(words, repeat=len(free)):
@@ -116,21 +116,28 @@ class Design(Strict):
         return tuple(cells)
 
     def cell_overrides(self, cell: Levels) -> tuple[str, ...]:
-        """Overrides that make the world of a cell, without those of the whole design."""
-        of_factors = (getattr(factor, cell[factor.letter]) for factor in self.factors)
-        combined = (each.overrides for each in self.combined if each.levels.items() <= cell.items())
-        return tuple(chain(*of_factors, *combined))
+        """Return the overrides that make the world of a cell, without those of the design."""
+        words: list[str] = []
+        for factor in self.factors:
+            words += factor.high if cell[factor.letter] == "high" else factor.low
+        for combined in self.combined:  # they win
+            if combined.levels.items() <= cell.items():
+                words += combined.overrides
+        return tuple(words)
 
     def effects(self, part: str) -> dict[str, dict[Effect, int]]:
-        """Shown name -> main effects and interactions of two factors with that contrast, and signs.
+        """Group main effects and interactions of two factors that have the same contrast.
 
         In a fraction several effects have the same contrast over the cells ("aliases"): their sum
-        is what is estimated. An alias with the sign -1 is subtracted.
+        is what is estimated.
+
+        Returns:
+            name as it is shown -> effects and their signs; an alias with -1 is subtracted.
         """
         cells = self.cells(part)
+        effects = [*self.letters, *map("".join, combinations(self.letters, 2))]
         groups: dict[tuple[int, ...], dict[Effect, int]] = {}
-        orders = (combinations(self.letters, order) for order in (1, 2))
-        for effect in map("".join, chain(*orders)):
+        for effect in effects:
             signs = tuple(sign_of(cell, effect) for cell in cells)
             opposite = tuple(-sign for sign in signs)
             if opposite in groups:
@@ -140,24 +147,26 @@ class Design(Strict):
         names = {factor.letter: factor.name for factor in self.factors}
         found = {}
         for group in groups.values():  # "noise", "occupancy x noise + complexity x size"
-            words = [
-                (" + " if sign > 0 else " - ") + " x ".join(names[each] for each in effect)
-                for effect, sign in group.items()
-            ]
-            found["".join(words)[3:]] = group
+            shown = ""
+            for effect, sign in group.items():
+                shown += " + " if sign > 0 else " - "
+                shown += " x ".join(names[letter] for letter in effect)
+            found[shown[3:]] = group
         return found
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """The attributes of its rows: of each method and trained cell, then of each method."""
+        """Yield the attributes of its rows: of methods in trained cells, then of methods alone."""
         for name, method in product((TRAINED, TESTED), self.methods):
-            if (part := self.parts.get(name)) is None:
+            part = self.parts.get(name)
+            if part is None:
                 continue
-            cells = {cell_name(each): self.cell_overrides(each) for each in self.cells(name)}
-            worlds = {cell: (*part.overrides, *words) for cell, words in cells.items()}
+            worlds: dict[str, tuple[str, ...]] = {}
+            for cell in self.cells(name):
+                worlds[cell_name(cell)] = (*part.overrides, *self.cell_overrides(cell))
             own = worlds if name == TRAINED else {"natural": ()}
-            for cell, words in own.items():
+            for label, words in own.items():
                 yield {
-                    "label": f"{method.name} {cell}",
+                    "label": f"{method.name} {label}",
                     "group": name,
                     "experiment": method.experiment,
                     "settings": {"method": method.name},
@@ -165,19 +174,24 @@ class Design(Strict):
                     "tested_in": worlds if name == TESTED else {},
                 }
 
+    def _free_letters(self, part: Part) -> list[str]:
+        """Return the letters of the factors whose level no generator gives."""
+        return [letter for letter in self.letters if letter not in part.generators]
+
     @model_validator(mode="after")
     def _check_names(self) -> Design:
-        names = ([f.name for f in self.factors], [m.name for m in self.methods])
-        for each in (self.letters, *names):
-            if len(set(each)) < len(each):
-                raise ValueError(f"a name is used twice in {', '.join(each)}.")
-        for letter in (letter for one in self.combined for letter in one.levels):
-            check_choice("combined.levels", letter, self.letters)
-        for index, method in enumerate(self.methods):
+        check_different(self.letters)
+        check_different([factor.name for factor in self.factors])
+        check_different([method.name for method in self.methods])
+        for combined in self.combined:
+            for letter in combined.levels:
+                check_choice("combined.levels", letter, self.letters)
+        earlier: list[str] = []
+        for method in self.methods:
             check_choice("methods.experiment", method.experiment, available("experiment"))
             if method.against is not None:
-                earlier = [each.name for each in self.methods[:index]]
                 check_choice("methods.against (an earlier method)", method.against, earlier)
+            earlier.append(method.name)
         return self
 
     @model_validator(mode="after")
@@ -185,7 +199,7 @@ class Design(Strict):
         if not self.parts:
             raise ValueError("expected trained, tested or both, got none.")
         for name, part in self.parts.items():
-            free = [letter for letter in self.letters if letter not in part.generators]
+            free = self._free_letters(part)
             for letter, others in part.generators.items():
                 check_choice("generators", letter, self.letters)
                 for other in others:
@@ -198,18 +212,21 @@ class Design(Strict):
                         f"generators: {main} cannot be told apart from "
                         f"{', '.join(aliases) or 'the mean'}; use products of three factors."
                     )
-            words = [[w.partition("=")[::2] for w in self.cell_overrides(cell)] for cell in cells]
-            worlds = {tuple(sorted(dict(each).items())) for each in words}  # the last value wins
+            worlds = set()
+            for cell in cells:
+                words = [word.partition("=") for word in self.cell_overrides(cell)]
+                last = {key: value for key, _, value in words}  # the last value wins
+                worlds.add(frozenset(last.items()))
             if len(worlds) < len(cells):
                 raise ValueError("two cells have equal overrides; a factor changes nothing.")
         return self
 
 
 def sign_of(cell: Levels, effect: Effect) -> int:
-    """The sign of a cell in the contrast of an effect: the product of those of its factors."""
+    """Multiply the signs of the levels of an effect's factors: its sign in a cell."""
     return prod(1 if cell[letter] == "high" else -1 for letter in effect)
 
 
 def cell_name(cell: Levels) -> str:
-    """The cell as it is shown: "O-N+"."""
+    """Return a cell as it is shown: "O-N+"."""
     return "".join(f"{letter}{'+' if level == 'high' else '-'}" for letter, level in cell.items())

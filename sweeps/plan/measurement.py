@@ -17,7 +17,7 @@ from rgbt.metrics.measurement import Measurement, dataset_words, settings_of
 from rgbt.metrics.pairs import protocol_of
 from rgbt.runs.result import OWN, RunResult
 
-# The head that predicts: that of the domain of each image, or that of one domain for all.
+# The head that predicts: that of the domain of an image, or that of one domain for all images.
 Head = Literal["as trained", "own", "source", "target"]
 
 BATCH = "data.eval_batch_size"
@@ -29,30 +29,31 @@ Words: TypeAlias = tuple[str, ...]
 
 
 def command_of(words: Words) -> Words:
-    """Module that makes a measurement, and its arguments except the run.
+    """Return the module that makes a measurement, and its arguments except the run.
 
     One call makes both protocols of virtual views, or several details.
     """
     options = _options(words)
     if protocol := options.get("frames"):
         return ("rgbt.consistency", f"frames={'next' if protocol == 'next' else 'virtual'}")
-    every = []
+    arguments = []
     for word in words:
         kind = word.removeprefix("details=")
         together = "all" if kind in SCENE_KINDS else "boundary,calibration"
-        every.append(word if kind == word else f"details={together}")
-    return ("rgbt.evaluate", *every)
+        arguments.append(word if kind == word else f"details={together}")
+    return ("rgbt.evaluate", *arguments)
 
 
 def stored_at(result: RunResult, words: Words) -> str | None:
-    """The file, inside the folder of a finished run, with the counts of a measurement."""
+    """Find the file, inside the folder of a finished run, with the counts of a measurement."""
     if not words:
         return OWN
     known = result.measurements()
     base = known.get(OWN)
     if base is None and words[0].startswith("frames="):
         # Pairs of frames may be all that there is of weights or predictions.
-        base = next((each for each in known.values() if not each.run), None)
+        of_files = [found for found in known.values() if not found.run]
+        base = of_files[0] if of_files else None
     if base is None:
         return None
     wanted = measurement_of(words, base)
@@ -60,7 +61,7 @@ def stored_at(result: RunResult, words: Words) -> str | None:
 
 
 def counts_of(result: RunResult, words: Words) -> Counts:
-    """The counts of a measurement of a finished run; InputError: there are none, or damaged."""
+    """Read the counts of a measurement of a run; InputError: there are none, or damaged ones."""
     path = stored_at(result, words)
     if path is None:
         shown = "this world" if dataset_words(words) else " ".join(words)
@@ -69,6 +70,7 @@ def counts_of(result: RunResult, words: Words) -> Counts:
 
 
 def _is_same(found: Measurement, wanted: Measurement) -> bool:
+    """Whether a stored measurement is the one that a table wants."""
     if wanted.dataset_words:  # they say which images these are
         return set(wanted.differences(found)) <= {"dataset"}
     protocol = protocol_of(wanted.partition)
@@ -82,7 +84,7 @@ def _is_same(found: Measurement, wanted: Measurement) -> bool:
 
 
 def measurement_of(words: Words, base: Measurement) -> Measurement:
-    """What `words` request of a run; `base`: the test that it ended with."""
+    """Return what `words` request of a run; `base` is the test that it ended with."""
     options = _options(words)
     found: dict[str, Any] = {"partition": base.partition}
     if (view := options.get("modality", "default")) != "default":

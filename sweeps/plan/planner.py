@@ -33,8 +33,10 @@ class PlannedPoint:
 
     def is_evaluated(self, results: Sequence[RunResult]) -> bool:
         """Whether there are runs, and all further evaluations of them."""
-        wanted = self.point.evaluations
-        return bool(results) and all(stored_at(one, each) for one in results for each in wanted)
+        for result in results:
+            if not all(stored_at(result, words) for words in self.point.evaluations):
+                return False
+        return bool(results)
 
 
 def specify_run(overrides: Sequence[str], *, checked: bool = True) -> RunSpec:

@@ -19,7 +19,7 @@ from rgbt.metrics import names
 from rgbt.metrics.measurement import Statistics
 from rgbt.metrics.named import PAIR_SCORES, details_of_metric, parse
 from rgbt.metrics.pairs import Protocol
-from sweeps.plan.claim import OTHERS, PREVIOUS, Claim, Strict
+from sweeps.plan.claim import OTHERS, PREVIOUS, Claim, Strict, check_different
 from sweeps.plan.design import Design
 from sweeps.plan.measurement import Head, Words
 
@@ -202,18 +202,17 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _add_rows_of_design(self) -> Table:
-        of_design = () if self.design is None else self.design.rows()
         if not self.rows and self.design is None:
             raise ValueError("'rows' has no value.")
-        return replace(self, rows=(*self.rows, *(Row(**each) for each in of_design)))
+        of_design = () if self.design is None else self.design.rows()
+        return replace(self, rows=(*self.rows, *(Row(**row) for row in of_design)))
 
     @model_validator(mode="after")
     def _check_names(self) -> Table:
-        for each in (self.columns, self.rows, self.claims):
-            used = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
-            if len(set(used)) < len(used):
-                raise ValueError(f"'{max(used, key=used.count)}' is used twice.")
-        released = (row.released.at for row in self.rows if row.released)
+        check_different([column.name for column in self.columns])
+        check_different([row.label for row in self.rows])
+        check_different([claim.name for claim in self.claims])
+        released = [row.released.at for row in self.rows if row.released]
         for at in (self.at, *(row.at for row in self.rows), *released):
             for scale in at or ():
                 check_choice("at", scale, available("scale"))
@@ -223,29 +222,31 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _check_columns(self) -> Table:
-        scores = [each.name for each in self.columns if each.metric is not None]
-        for index, column in enumerate(self.columns):
-            before = [each.name for each in self.columns[:index] if each.sources]
+        known = [column.name for column in self.columns if is_counted(column)]
+        for column in self.columns:
             for name in column.sources:  # they are computed in order
-                check_choice(f"column '{column.name}'", name, [*scores, *before])
+                check_choice(f"column '{column.name}'", name, known)
+            if column.sources:
+                known.append(column.name)
         for name in self.design.outcomes if self.design else ():
-            check_choice("design.outcomes", name, [each.name for each in self.columns])
+            check_choice("design.outcomes", name, self._names)
         return self
 
     @model_validator(mode="after")
     def _check_rows(self) -> Table:
-        columns = [each.name for each in self.columns]
-        printed = [each.name for each in self.columns if each.printed]
-        labels = [each.label for each in self.rows]
-        for index, row in enumerate(self.rows):
+        printed = [column.name for column in self.columns if column.printed]
+        metrics = [column.metric for column in self.columns if column.metric is not None]
+        earlier: list[str] = []
+        for row in self.rows:
             where = f"row '{row.label}'"
             if row.same_as is not None:
-                check_choice(f"{where}, same_as (an earlier row)", row.same_as, labels[:index])
+                check_choice(f"{where}, same_as (an earlier row)", row.same_as, earlier)
+            earlier.append(row.label)
             for name in row.without:
-                check_choice(f"{where}, without", name, columns)
+                check_choice(f"{where}, without", name, self._names)
             for name in (*row.values, *row.doubtful):
                 check_choice(f"{where}, printed column", name, printed)
-            for metric in (each.metric for each in self.columns if each.metric is not None):
+            for metric in metrics:
                 for key in re.findall(r"{(\w+)}", metric):
                     check_choice(f"{where}, settings for '{metric}'", key, row.settings)
                 parse(metric.format_map(row.settings))
@@ -253,31 +254,38 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _check_claims(self) -> Table:
-        labels = [each.label for each in self.rows]
-        design = self.design
+        labels = [row.label for row in self.rows]
         for claim in self.claims:
+            where = f"claim '{claim.name}'"
             if claim.effect:
-                methods = [each.name for each in design.methods] if design else []
-                for name in claim.rows:
-                    check_choice(f"claim '{claim.name}', methods", name, methods)
-                for name in claim.columns:
-                    known = design.outcomes if design else ()
-                    check_choice(f"claim '{claim.name}', outcomes", name, known)
-                for letter in claim.effect:
-                    letters = design.letters if design else ()
-                    check_choice(f"claim '{claim.name}', effect", letter, letters)
-                if design and claim.part:
-                    check_choice(f"claim '{claim.name}', part", claim.part, design.parts)
+                self._check_effect(claim, where)
                 continue
-            named = claim.against if claim.against not in ((OTHERS,), (PREVIOUS,)) else ()
-            for label in (*claim.rows, *named):
-                check_choice(f"claim '{claim.name}', rows", label, labels)
-            for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
-                columns = [each.name for each in self.columns]
-                check_choice(f"claim '{claim.name}', columns", name, columns)
-            if not claim.columns or not any(True for _ in claim.pairs(labels)):
-                raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
+            against = () if claim.against in ((OTHERS,), (PREVIOUS,)) else claim.against
+            for label in (*claim.rows, *against):
+                check_choice(f"{where}, rows", label, labels)
+            minus = () if claim.minus_column is None else (claim.minus_column,)
+            for name in (*claim.columns, *minus):
+                check_choice(f"{where}, columns", name, self._names)
+            if not claim.columns or not list(claim.pairs(labels)):
+                raise ValueError(f"{where}: there is nothing to compare.")
         return self
+
+    def _check_effect(self, claim: Claim, where: str) -> None:
+        """Refuse a claim about what is not in the design."""
+        design = self.design
+        methods = [method.name for method in design.methods] if design else []
+        for name in claim.rows:
+            check_choice(f"{where}, methods", name, methods)
+        for name in claim.columns:
+            check_choice(f"{where}, outcomes", name, design.outcomes if design else ())
+        for letter in claim.effect:
+            check_choice(f"{where}, effect", letter, design.letters if design else ())
+        if design and claim.part:
+            check_choice(f"{where}, part", claim.part, design.parts)
+
+    @property
+    def _names(self) -> list[str]:
+        return [column.name for column in self.columns]
 
     @property
     def runnable_rows(self) -> list[Row]:
@@ -285,60 +293,54 @@ class Table(Strict):
         return [row for row in self.rows if row.experiment is not None]
 
     def columns_of(self, row: Row) -> tuple[Column, ...]:
-        """The columns of the row, in their order: without `Row.without`."""
-        left_out, last = set(row.without), -1
-        while last < len(left_out):
-            last = len(left_out)
-            left_out |= {each.name for each in self.columns if left_out & set(each.sources)}
-        return tuple(column for column in self.columns if column.name not in left_out)
+        """Return the columns of the row, in their order: without `Row.without`."""
+        left_out = set(row.without)
+        kept = []
+        for column in self.columns:  # a column follows those that it is computed from
+            if left_out & {column.name, *column.sources}:
+                left_out.add(column.name)
+            else:
+                kept.append(column)
+        return tuple(kept)
 
     def overrides(self, row: Row, scale: str, form: Form = "paper") -> tuple[str, ...]:
-        """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself."""
+        """Return the overrides of a run that make the row, beside ``scale=...`` itself."""
         if row.experiment is None:
             raise InputError(f"row '{row.label}' has no experiment; it is shown as published only.")
         chosen = row.released if form == "released" and row.released else ReleasedForm()
         overrides = row.overrides if chosen.overrides is None else chosen.overrides
         at = row.at if chosen.at is None else chosen.at
         experiment = chosen.experiment or row.experiment
-        shared, own = (each.get(chosen_scale(scale, each), ()) for each in (self.at, at))
+        shared = self.at.get(chosen_scale(scale, self.at), ())
+        own = at.get(chosen_scale(scale, at), ())
         return (f"+experiment={experiment}", *shared, *overrides, *own)
 
     def headlines(self) -> list[Column]:
-        """Columns of `HEADLINES`, over all images or those of the day or the night."""
-        shown = {f"{part}{each}" for part in ("", "day/", "night/") for each in HEADLINES}
-        return [each for each in self.columns if each.metric in shown]
+        """Return the columns of `HEADLINES`, over all images or those of the day or the night."""
+        shown = {f"{part}{metric}" for part in ("", "day/", "night/") for metric in HEADLINES}
+        return [column for column in self.columns if column.metric in shown]
 
     def both_forms(self) -> Table:
-        """The table with a second row for each one that the release makes in another way.
+        """Return the table with a second row for every row that the release makes differently.
 
         Its claims are that the released form scores higher; those of the paper are left out, as
         they are about the rows of one form. InputError: no row has a released form of its own.
         """
         rows: list[Row] = []
         claims: list[Claim] = []
-        scores = [each for each in self.columns if each.metric is not None]
+        compared = self.headlines() or [column for column in self.columns if is_counted(column)]
         for row in self.rows:
             rows.append(row)
             if row.released is None:
                 continue
             label = f"{row.label}{RELEASED}"
-            own = {key: each for key, each in vars(row.released).items() if each is not None}
+            own = {key: value for key, value in vars(row.released).items() if value is not None}
             rows.append(
                 replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
             )
-            claims += [
-                Claim(
-                    name=f"{label}, {column.name}",
-                    says=f"{row.label}: the released form has a higher {column.name}.",
-                    source="form=both",
-                    rows=(label,),
-                    against=(row.label,),
-                    columns=(column.name,),
-                    expected="higher",
-                )
-                for column in self.headlines() or scores
-                if column in self.columns_of(row)
-            ]
+            for column in compared:
+                if column in self.columns_of(row):
+                    claims.append(_released_is_higher(row, column))
         if not claims:
             raise InputError(
                 f"form=both: no row of {self.paper}, {self.number} has a released form of its own; "
@@ -347,13 +349,27 @@ class Table(Strict):
         return replace(self, rows=tuple(rows), claims=tuple(claims))
 
 
+def _released_is_higher(row: Row, column: Column) -> Claim:
+    """Return the claim that form=both judges of a row and column."""
+    label = f"{row.label}{RELEASED}"
+    return Claim(
+        name=f"{label}, {column.name}",
+        says=f"{row.label}: the released form has a higher {column.name}.",
+        source="form=both",
+        rows=(label,),
+        against=(row.label,),
+        columns=(column.name,),
+        expected="higher",
+    )
+
+
 def metric_of(column: Column, row: Row) -> str:
-    """The column's metric with placeholders such as ``{class}`` filled from the row's settings."""
+    """Fill placeholders of the column's metric, such as ``{class}``, from the row's settings."""
     return str(column.metric).format_map(row.settings)
 
 
 def words_of(column: Column, table: Table) -> Words:
-    """The measurement that a column needs; (): the test that every run ends with."""
+    """Return the measurement that a column needs; (): the test that every run ends with."""
     if column.frames is not None:
         return (f"frames={column.frames}",)
     given: dict[str, Any] = {
@@ -371,7 +387,7 @@ def words_of(column: Column, table: Table) -> Words:
 
 
 def world_words(table: Table, row: Row) -> dict[str, Words]:
-    """Name -> measurement of the row's network in every world of `Row.tested_in`."""
+    """Return the measurement of the row's network in every world of `Row.tested_in`, by name."""
     usual = words_of(Column(name=names.MIOU, metric=names.MIOU), table)
     return {name: (*usual, *overrides) for name, overrides in row.tested_in.items()}
 
@@ -382,21 +398,21 @@ def is_counted(column: Column) -> bool:
 
 
 def table_names(folder: Path = OWN) -> list[str]:
-    """Names for `load_table`: the papers' tables, then those in `folder`."""
-    return [
-        path.relative_to(root).with_suffix("").as_posix()
-        for root in (PUBLISHED, folder)
-        for path in sorted(root.rglob("*.yaml"))
-    ]
+    """Return the names for `load_table`: the papers' tables, then those in `folder`."""
+    names = []
+    for root in (PUBLISHED, folder):
+        for path in sorted(root.rglob("*.yaml")):
+            names.append(path.relative_to(root).with_suffix("").as_posix())
+    return names
 
 
 def study_names() -> list[str]:
-    """Names for `load_table` of our own studies."""
+    """Return the names for `load_table` of our own studies."""
     return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
 
 
 def table_path(name: str, folder: Path = OWN) -> Path:
-    """The file of a table; InputError: no such table, or two of that name.
+    """Find the file of a table; InputError: no such table, or two of that name.
 
     "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one in
     the `folder` of the user's tables; or a path that ends in .yaml.

@@ -8,16 +8,17 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from analysis.uncertainty.contrasts import FIXED
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.runs.result import RunResult
 from sweeps.plan.measurement import Words, counts_of
+from sweeps.plan.request import RowSeed
 from sweeps.plan.table import Column, Form, Row, Table, is_counted, metric_of, words_of
 from sweeps.point import Outcome
 
 NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
-NO_SEED = "-1"  # seed of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 
 CellId = tuple[str, str]  # (label of the row, name of the column)
 Value = float | str  # a score, or the reason why there is none
@@ -44,44 +45,109 @@ class TableCell:
     keys: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class ScoredTable:
+    """A table with our values.
+
+    Attributes:
+        cells: only of rows that were run, and of sizes of networks.
+        commits: git commit -> number of runs made by it.
+        lists: label of a row that was run -> the lists of its runs, in words.
+        marks: 1 for a row that is shown to be the best of the column, 2 for the second best.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    cells: Mapping[CellId, TableCell]
+    commits: Mapping[str, int]
+    form: Form = "paper"
+    lists: Mapping[str, str] = field(default_factory=dict)
+    marks: Mapping[CellId, int] = field(default_factory=dict)
+
+    def difference(self, row: Row, column: Column) -> float:
+        """Subtract the printed value from ours; NaN where one is missing."""
+        cell = self.cells.get((row.label, column.name))
+        printed = published(row, column)
+        return math.nan if cell is None or printed is None else cell.mean - printed
+
+
+def score(
+    name: str,
+    table: Table,
+    runs: Mapping[RowSeed, Outcome],
+    *,
+    scale: str,
+    sizes: Mapping[CellId, TableCell] | None = None,
+    reader: Reader = counts_of,
+) -> ScoredTable:
+    """Compute every cell of the rows with `runs`; `sizes` are those of networks."""
+    seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
+    cells: dict[CellId, TableCell] = {}
+    for row in table.rows:
+        outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
+        cells |= _row_cells(table, row, outcomes, reader)
+    lists: dict[str, set[str]] = {}
+    made_by: dict[str, str | None] = {}
+    for (label, _), outcome in runs.items():
+        for run in outcome.results:
+            made_by[run.key] = run.commit
+            if run.lists:
+                lists.setdefault(label, set()).add(run.lists)
+    return ScoredTable(
+        name=name,
+        table=table,
+        scale=scale,
+        seeds=tuple(seed for seed in seeds if seed >= 0),
+        cells=cells | dict(sizes or {}),
+        commits=Counter(commit for commit in made_by.values() if commit is not None),
+        lists={label: " or ".join(sorted(names)) for label, names in lists.items()},
+    )
+
+
 def is_of_runs(column: Column) -> bool:
     """Whether the column has values of runs."""
     return column.efficiency is None
 
 
-def row_cells(
+def _row_cells(
     table: Table, row: Row, outcomes: Mapping[int, Outcome], reader: Reader
 ) -> dict[CellId, TableCell]:
-    """The cells of one row, whose runs are given by seed, in columns with values of runs."""
+    """Return the cells of one row, whose runs are given by seed, in columns with values of runs."""
+    if not outcomes:
+        return {}
     by_seed = {seed: _values(table, row, outcome, reader) for seed, outcome in outcomes.items()}
     keys = tuple(run.key for outcome in outcomes.values() for run in outcome.results)
     cells = {}
     for column in filter(is_of_runs, table.columns_of(row)):
-        by_column = {seed: values[column.name] for seed, values in by_seed.items() if values}
-        missing = [outcomes[seed] for seed, each in by_column.items() if isinstance(each, str)]
-        marks = [NO_VALUE if run.state == "finished" else run.state for run in missing]
-        if by_column:
-            cells[row.label, column.name] = over_seeds(by_column, "".join(marks[:1]), keys)
+        values = {seed: found[column.name] for seed, found in by_seed.items()}
+        missing = [outcomes[seed].state for seed, found in values.items() if isinstance(found, str)]
+        mark = missing[0] if missing else ""
+        mark = NO_VALUE if mark == "finished" else mark
+        cells[row.label, column.name] = over_seeds(values, mark, keys)
     return cells
 
 
 def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[str, Value]:
-    """Every column's value of one run."""
+    """Return every column's value of one run."""
     counts: dict[Words, Counts | str] = {}
     values: dict[str, Value] = {}
     columns = table.columns_of(row)
-    for column in filter(is_counted, columns):
-        words = words_of(column, table)
-        if words not in counts:
-            counts[words] = _counts(outcome, words, reader)
-        values[column.name] = _value(metric_of(column, row), counts[words], table)
+    for column in columns:
+        if is_counted(column):
+            words = words_of(column, table)
+            if words not in counts:
+                counts[words] = _counts(outcome, words, reader)
+            values[column.name] = _value(metric_of(column, row), counts[words], table)
     for column in columns:
         if column.sources:
-            values[column.name] = derived(column, [values[name] for name in column.sources])
+            values[column.name] = _derived(column, [values[name] for name in column.sources])
     return values
 
 
 def _counts(outcome: Outcome, words: Words, reader: Reader) -> Counts | str:
+    """Return the counts of a measurement, or the reason why there are none."""
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
     run = outcome.results[0]
@@ -101,27 +167,31 @@ def _value(metric: str, counts: Counts | str, table: Table) -> Value:
     return f"'{metric}' has nothing to score" if math.isnan(score) else score
 
 
-def derived(column: Column, values: Sequence[Value]) -> Value:
-    """Difference or mean of the values of `column.sources`, or the reason why one is missing."""
-    known = [each for each in values if not isinstance(each, str)]
-    if len(known) < len(values):
-        return next(each for each in values if isinstance(each, str))
+def _derived(column: Column, values: Sequence[Value]) -> Value:
+    """Subtract or average the values of `column.sources`; or return why one is missing."""
+    known: list[float] = []
+    for found in values:
+        if isinstance(found, str):
+            return found
+        known.append(found)
     return statistics.fmean(known) if column.minus is None else known[0] - known[1]
 
 
 def over_seeds(
     by_seed: Mapping[int, Value], mark: str = "", keys: tuple[str, ...] = ()
 ) -> TableCell:
-    """Mean and spread of the values of several seeds; for `mark` and `keys` see `TableCell`."""
-    values = [each for each in by_seed.values() if not isinstance(each, str)]
-    reasons: dict[str, list[str]] = {}
-    for seed, each in by_seed.items():
-        if isinstance(each, str):
-            reasons.setdefault(each, []).append(str(seed))
-    sentences = [
-        why if seeds == [NO_SEED] else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {why}"
-        for why, seeds in reasons.items()
-    ]
+    """Return mean and spread of the values of seeds; for `mark` and `keys` see `TableCell`."""
+    values: list[float] = []
+    reasons: dict[str, list[int]] = {}
+    for seed, found in by_seed.items():
+        if isinstance(found, str):
+            reasons.setdefault(found, []).append(seed)
+        else:
+            values.append(found)
+    sentences = []
+    for reason, seeds in reasons.items():
+        which = f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}: "
+        sentences.append(reason if seeds == [FIXED] else f"{which}{reason}")
     return TableCell(
         mean=statistics.fmean(values) if values else math.nan,
         sd=statistics.stdev(values) if len(values) > 1 else math.nan,
@@ -132,73 +202,14 @@ def over_seeds(
     )
 
 
-@dataclass(frozen=True)
-class ScoredTable:
-    """A table with our values.
-
-    Attributes:
-        cells: only of rows that were run, and of sizes of networks.
-        commits: git commit -> number of runs made by it.
-        lists: label of a row that was run -> the lists of its runs, in words.
-        marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
-            `sweeps.judge.judged_table.JudgedTable`.
-    """
-
-    name: str
-    table: Table
-    scale: str
-    seeds: tuple[int, ...]
-    cells: Mapping[CellId, TableCell]
-    commits: Mapping[str, int]
-    form: Form = "paper"
-    lists: Mapping[str, str] = field(default_factory=dict)
-    marks: Mapping[CellId, int] = field(default_factory=dict)
-
-    def difference(self, row: Row, column: Column) -> float:
-        """Ours less the printed value; NaN where one is missing."""
-        cell = self.cells.get((row.label, column.name))
-        printed = published(row, column)
-        return math.nan if cell is None or printed is None else cell.mean - printed
-
-
 def published(row: Row, column: Column) -> float | None:
-    """The printed value, or None where there is none or a dash."""
+    """Return the printed value, or None where there is none or a dash."""
     printed = row.values.get(column.name)
     return None if printed is None else float(printed)
 
 
-def score(
-    name: str,
-    table: Table,
-    runs: Mapping[tuple[str, int], Outcome],
-    *,
-    scale: str,
-    sizes: Mapping[CellId, TableCell] | None = None,
-    reader: Reader = counts_of,
-) -> ScoredTable:
-    """Compute every cell of the rows with `runs`; `sizes` are those of networks."""
-    seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
-    cells: dict[CellId, TableCell] = {}
-    for row in table.rows:
-        outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
-        cells |= row_cells(table, row, outcomes, reader)
-    lists: dict[str, list[str]] = {}
-    for (label, _), outcome in runs.items():
-        lists.setdefault(label, []).extend(run.lists for run in outcome.results if run.lists)
-    made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
-    return ScoredTable(
-        name=name,
-        table=table,
-        scale=scale,
-        seeds=tuple(seed for seed in seeds if seed >= 0),
-        cells=cells | dict(sizes or {}),
-        commits=Counter(commit for commit in made_by.values() if commit is not None),
-        lists={label: " or ".join(sorted(set(each))) for label, each in lists.items() if each},
-    )
-
-
 def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, int]:
-    """Marks of columns that are counted without a run and so are exact: 1 best, 2 second best.
+    """Mark sizes of networks, which are counted and so are exact: 1 best, 2 second best.
 
     Sizes that are equal as shown share a mark. Where all are equal none has one.
     """
@@ -206,12 +217,14 @@ def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, 
     for column in table.columns:
         if column.efficiency is None or column.best == "none":
             continue
-        values = {
-            cell_id: round(cell.mean, 2)
-            for cell_id, cell in sizes.items()
-            if cell_id[1] == column.name and not math.isnan(cell.mean)
-        }
-        best = sorted(set(values.values()), reverse=column.best == "highest")[:2]
-        if len(best) == 2:
-            marks |= {each: best.index(v) + 1 for each, v in values.items() if v in best}
+        shown: dict[CellId, float] = {}
+        for cell_id, cell in sizes.items():
+            if cell_id[1] == column.name and not math.isnan(cell.mean):
+                shown[cell_id] = round(cell.mean, 2)
+        best = sorted(set(shown.values()), reverse=column.best == "highest")[:2]
+        if len(best) < 2:
+            continue
+        for cell_id, size in shown.items():
+            if size in best:
+                marks[cell_id] = best.index(size) + 1
     return marks

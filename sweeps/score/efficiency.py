@@ -18,25 +18,31 @@ NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")  # overrides that begi
 
 
 def network_sizes(request: TableRequest) -> dict[CellId, TableCell]:
-    """Millions of parameters of each row; the reason where a network cannot be built."""
-    named = [each.name for each in request.table.columns if each.efficiency == "parameters"]
+    """Return the cells with millions of parameters of the rows' networks.
+
+    Of a network that cannot be built, the cell has the reason.
+    """
+    names = {column.name for column in request.table.columns if column.efficiency == "parameters"}
+    if not names:
+        return {}
     at_paper = replace(request, scale=SCALE, pretrained={})
     cells: dict[CellId, TableCell] = {}
-    for row in request.table.runnable_rows if named else ():
+    for row in request.table.runnable_rows:
         words = at_paper.overrides(row.label, 0)[:-1]
         kept = tuple(word for word in words if not word.lstrip("+~").startswith(NOT_NETWORK))
         try:
             cell = TableCell(million_parameters(kept), math.nan, 0)
         except InputError as error:
             cell = TableCell(math.nan, math.nan, 0, str(error), NO_VALUE)
-        columns = {each.name for each in request.table.columns_of(row)}
-        cells |= {(row.label, name): cell for name in named if name in columns}
+        for column in request.table.columns_of(row):
+            if column.name in names:
+                cells[row.label, column.name] = cell
     return cells
 
 
 @cache
 def million_parameters(overrides: tuple[str, ...]) -> float:
-    """Millions of parameters of the network that overrides of `python -m rgbt.run` describe.
+    """Count the millions of parameters of the network that overrides of a run describe.
 
     It is built on torch's device "meta". Discriminators are not counted. InputError: as refused.
     """

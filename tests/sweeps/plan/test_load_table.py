@@ -160,10 +160,10 @@ def test_table_overrides_precede_row_overrides() -> None:
 def test_columns_of_row_omit_dependent_columns() -> None:
     row = Row(label="a", experiment="crm", without=("night",))
     columns = (
-        Column(name="far", mean=("both", "day")),
         Column(name="day", metric="day/mIoU"),
         Column(name="night", metric="night/mIoU"),
         Column(name="both", mean=("day", "night")),
+        Column(name="far", mean=("both", "day")),
     )
     table = Table(paper="", number="", caption="", data="", columns=columns, rows=(row,))
     assert [column.name for column in table.columns_of(row)] == ["day"]
