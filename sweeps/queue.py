@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 from analysis.archive import add
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
-from sweeps.judge.judged_table import TableJudge, contrasts_of
+from sweeps.judge.contrasts import contrasts_of
+from sweeps.judge.judged_table import JudgedTable
 from sweeps.judge.until_decided import SeedsUntilDecided
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import TAG, TableRequest, seed_of
@@ -60,9 +60,8 @@ class Queue:
         points: list[Point] = []
         for place, request in enumerate(self.requests):
             # Nothing is counted of the networks themselves.
-            rule = AnyTime() if request.until_decided else FixedSeeds()
-            judge = TableJudge(request.name, request.table, rule)
-            self._tables.append(SeedsUntilDecided(request, judge, self.max_seeds))
+            judged = JudgedTable(request=request)
+            self._tables.append(SeedsUntilDecided(judged, self.max_seeds))
             of_table = request.points()
             points += of_table
             self._owners += [place] * len(of_table)
@@ -81,7 +80,7 @@ class Queue:
         for place, table in enumerate(self._tables):
             pairs = zip(outcomes, owners, strict=True)
             own = [outcome for outcome, owner in pairs if owner == place]
-            new = table(own) if table.request.until_decided else []
+            new = table(own) if table.judged.request.until_decided else []
             waiting = [outcome.point for outcome in own if outcome.state == "waiting"]
             self._count(table, own, [*waiting, *new])
             added += new
@@ -108,8 +107,9 @@ class Queue:
         self, seeds: SeedsUntilDecided, outcomes: Sequence[Outcome], missing: list[Point]
     ) -> None:
         """Add what the missing runs of a table are worth; claims on a design need all its rows."""
-        request, table = seeds.request, seeds.request.table
-        claims = seeds.judge.claims(request.runs(outcomes))
+        request = seeds.judged.request
+        table = request.table
+        claims = replace(seeds.judged, runs=request.runs(outcomes)).claims
         words_of = {judged.claim.name: judged.word for judged in claims}
         elsewhere = set()
         for outcome in outcomes:

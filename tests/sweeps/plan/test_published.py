@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sweeps.judge.judged_table import as_claimed, contrasts_of, printed_values
+from sweeps.judge.contrasts import as_claimed, contrasts_of, printed_values
 from sweeps.plan.table import Row, load_table, table_names
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
