@@ -75,7 +75,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.progress import track
 
     from analysis.results import finished_runs
-    from sweeps.judge.stored_tables import FinishedRuns, TableResults
+    from sweeps.judge.judged_table import JudgedTable
+    from sweeps.judge.reader import RunReader
+    from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
     from sweeps.plan.request import (
         TableRequest,
@@ -85,15 +87,15 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
         read_named,
     )
     from sweeps.plan.table import is_own, table_names
+    from sweeps.score.efficiency import network_sizes
 
     names = table_names(Path("none"))
     if options.table != ALL:
         names = split_list(options.table, "tables")
-    finished = FinishedRuns(finished_runs(options.runs_dir, options.archive))
+    reader = RunReader(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
-    source = TableResults(finished, planner, counted=True)
     judged: list[JudgedClaim] = []
     for typed in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(typed)
@@ -109,7 +111,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
             )
         if overrides or is_own(typed):  # a test checks the others
             check_equal_runs(request, planner)
-        judged += source.result(request, checked=bool(overrides)).claims
+        runs = runs_of_request(request, reader, planner, checked=bool(overrides))
+        sizes = network_sizes(request)
+        judged += JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader).claims
     return judged
 
 

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 from analysis.archive import add
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
-from sweeps.judge.judged_table import TableJudge, contrasts_of
+from sweeps.judge.contrasts import contrasts_of
+from sweeps.judge.judged_table import JudgedTable
 from sweeps.judge.until_decided import SeedsUntilDecided
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import TAG, TableRequest, seed_of
@@ -60,9 +60,8 @@ class Queue:
         points: list[Point] = []
         for place, request in enumerate(self.requests):
             # Nothing is counted of the networks themselves.
-            rule = AnyTime() if request.until_decided else FixedSeeds()
-            judge = TableJudge(request.name, request.table, rule)
-            self._tables.append(SeedsUntilDecided(request, judge, self.max_seeds))
+            judged = JudgedTable(request=request)
+            self._tables.append(SeedsUntilDecided(judged, self.max_seeds))
             of_table = request.points()
             points += of_table
             self._owners += [place] * len(of_table)
@@ -81,7 +80,7 @@ class Queue:
         for place, table in enumerate(self._tables):
             pairs = zip(outcomes, owners, strict=True)
             own = [outcome for outcome, owner in pairs if owner == place]
-            new = table(own) if table.request.until_decided else []
+            new = table(own) if table.judged.request.until_decided else []
             waiting = [outcome.point for outcome in own if outcome.state == "waiting"]
             self._count(table, own, [*waiting, *new])
             added += new
@@ -90,24 +89,27 @@ class Queue:
 
     def _note_finished(self, outcomes: Sequence[Outcome]) -> None:
         """Archive the runs of newly finished points, and note how long they took."""
+        archive = None if self.is_dry else self.runs.archive
+        seen, self._seen = self._seen, set()
         for place, outcome in enumerate(outcomes):
-            if outcome.state != "finished" or place in self._seen:
+            if outcome.state != "finished":
+                continue
+            self._seen.add(place)
+            if place in seen:
                 continue
             for result in outcome.results:
-                is_kept = self.runs.archive is not None and not self.is_dry
-                if is_kept and self.runs.is_own(result):
-                    add(result, self.runs.archive)
+                if archive is not None and self.runs.is_own(result):
+                    add(result, archive)
             if outcome.seconds is not None:
                 self._seconds[self._network(outcome.point)].append(outcome.seconds)
-        finished = (n for n, outcome in enumerate(outcomes) if outcome.state == "finished")
-        self._seen = set(finished)
 
     def _count(
         self, seeds: SeedsUntilDecided, outcomes: Sequence[Outcome], missing: list[Point]
     ) -> None:
         """Add what the missing runs of a table are worth; claims on a design need all its rows."""
-        request, table = seeds.request, seeds.request.table
-        claims = seeds.judge.claims(request.runs(outcomes))
+        request = seeds.judged.request
+        table = request.table
+        claims = replace(seeds.judged, runs=request.runs(outcomes)).claims
         words_of = {judged.claim.name: judged.word for judged in claims}
         elsewhere = set()
         for outcome in outcomes:

@@ -8,15 +8,12 @@ from __future__ import annotations
 import gc
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from analysis.commands import Resamples, check_out
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-
-if TYPE_CHECKING:
-    from sweeps.show.pages import Report
 
 # Remarks that are printed to stderr; the page has all.
 MAX_REMARKS = 5
@@ -48,62 +45,38 @@ def main(options: Options, overrides: list[str]) -> int:
     network is needed.
     """
     del overrides  # none is heeded
-    out = options.out
+    out, is_markdown = options.out, options.format == "markdown"
     check_out(out)
 
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import info, path_lines, print_rich
+    from sweeps.show.pages import Report
 
     gc.set_threshold(1_000_000, 20, 20)  # a tenth of the time, for 40 MB: many small objects stay
-    report = report_of(
-        options.runs_dir, options.archive, options.resamples, counted=options.format == "markdown"
-    )
-    files = {out / "index.html": report.html()} if options.format == "html" else {}
-    if options.format == "markdown":
+    report = Report(options.runs_dir, options.archive, options.resamples, counted=is_markdown)
+    if is_markdown:
         files = {out / name: text for name, text in report.pages().items()}
         files |= {page: report.filled(page.read_text()) for page in options.fill}
+    else:
+        files = {out / "index.html": report.html()}
     out.mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
         write_atomic(path, text.encode(errors="xmlcharrefreplace"))
-    if options.format == "markdown":
-        images = report.images
-        for stale in {path.name for path in out.glob("*.svg")} - set(images):
-            (out / stale).unlink()
-        for name, content in images.items():
+    if is_markdown:
+        for path in out.glob("*.svg"):
+            if path.name not in report.images:
+                path.unlink()
+        for name, content in report.images.items():
             write_atomic(out / name, content)
     for remark in report.remarks[:MAX_REMARKS]:
         info(remark)
     if len(report.remarks) > MAX_REMARKS:
         info(f"{len(report.remarks) - MAX_REMARKS} more remarks are on the page.")
-    run = sum(view.is_run for view in report.views)
-    held = f"{sum(1 for _ in report.source.finished)} runs, {run} tables with runs"
-    print_rich(path_lines([*(("page", str(path)) for path in files), ("holds", held)]))
+    runs = len(list(report.reader))
+    tables = sum(table.is_run for table in report.tables)
+    lines = [("page", str(path)) for path in files]
+    print_rich(path_lines([*lines, ("holds", f"{runs} runs, {tables} tables with runs")]))
     return 0
-
-
-def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -> Report:
-    """The report of a folder of runs and an archive; `counted`: with sizes of networks."""
-    from rich.console import Console
-    from rich.progress import track
-
-    from analysis.results import finished_runs
-    from rgbt.config.options import readable_paths
-    from sweeps.judge.stored_tables import FinishedRuns, TableResults, known_tables
-    from sweeps.plan.planner import Planner
-    from sweeps.show import pages
-
-    runs = finished_runs(runs_dir, archive)
-    planner = Planner(readable_paths([f"runs_dir={runs_dir}"]))
-    remarks: list[str] = []
-    source = TableResults(
-        FinishedRuns(runs), planner, known_tables(remarks), resamples, counted, remarks
-    )
-    notes = {path.parent.name: path for path in sorted(runs_dir.glob("studies/*/study.md"))}
-    studies = {name: path.read_text(errors="replace") for name, path in notes.items()}
-    console = Console(stderr=True)
-    return pages.Report(
-        source, runs, studies, lambda items: track(list(items), "tables", console=console)
-    )
 
 
 entry = PlainCommand(Options, main, heeds=())

@@ -162,9 +162,7 @@ def reproduce_one(
     planner: Planner,
 ) -> int:
     """Run what one table lacks, and publish it; 1 if a cell failed or has no value."""
-    from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
-    from sweeps.judge.judged_table import TableJudge, rule_of
-    from sweeps.judge.stored_tables import TableResult
+    from sweeps.judge.judged_table import JudgedTable
     from sweeps.judge.until_decided import SeedsUntilDecided
     from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
     from sweeps.score.efficiency import network_sizes
@@ -172,11 +170,10 @@ def reproduce_one(
     from sweeps.show.publish import print_preview, publish_table
 
     request = request_of(options, options.table, words, planner)
-    rule = AnyTime() if request.until_decided else FixedSeeds()
     sizes = {} if options.dry_run else network_sizes(request)
-    judge = TableJudge(request.name, request.table, rule, sizes=sizes)
+    judged = JudgedTable(request=request, sizes=sizes)
     external: dict[RowSeed, Outcome] = {}
-    seeds = SeedsUntilDecided(request, judge, options.max_seeds, external)
+    seeds = SeedsUntilDecided(judged, options.max_seeds, external)
     points = PointList(
         request.study,
         f"{request.name} scale={request.scale}",
@@ -195,11 +192,9 @@ def reproduce_one(
     outcomes = run_points(points, settings) if points.points else []
     if outcomes is None:
         return 0
-    if not request.until_decided:  # an earlier command may have added seeds
-        judge.rule = rule_of(result for outcome in outcomes for result in outcome.results)
-    result = TableResult(request, {**request.runs(outcomes), **external}, judge)
+    judged = replace(judged, runs={**request.runs(outcomes), **external})
     out = options.out or options.runs_dir / "tables" / f"{request.name}_{request.variant}"
-    return publish_table(result, outcomes, out)
+    return publish_table(judged, outcomes, out)
 
 
 def reproduce_several(

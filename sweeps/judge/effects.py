@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,26 +14,29 @@ from analysis.uncertainty.contrasts import Evidence, Term, combine
 from analysis.uncertainty.effects import Effect, Noise, estimate_effects
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT
-from sweeps.judge.judged_table import Cell, CellRunId, TableJudge
-from sweeps.plan.design import Design, sign_of
-from sweeps.point import Outcome
+from sweeps.judge.contrasts import Cell
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.plan.design import TESTED, TRAINED, Design, sign_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NOISE: Mapping[str, Noise] = {"trained": "cells", "tested": "effects"}
+NOISE: dict[str, Noise] = {TRAINED: "cells", TESTED: "effects"}
 
 # Name of the line that is no effect: the outcome itself.
 MEAN = "mean of all cells"
 
-NUMBERS = ("value", "low", "high", "p", "p_holm")
 COLUMNS = (
     "part",
     "outcome",
     "method",
     "against",
     "effect",
-    *NUMBERS,
+    "value",
+    "low",
+    "high",
+    "p",
+    "p_holm",
     "shown",
     "error_seeds",
     "error_images",
@@ -42,108 +45,120 @@ COLUMNS = (
 )
 
 
-class Effects(NamedTuple):
-    """What the finished runs of a design show, and sentences on methods that lack runs.
+def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
+    """Estimate every effect on a method that finished runs allow, and its difference to another.
 
-    `frame` has one effect a row and the columns `COLUMNS`. `low` and `high` are the ends of the
-    interval over images and seeds. `p_holm` is corrected for the main effects, or the interactions,
-    of a method; `shown` says whether the effect differs from 0 by it. Errors are standard errors.
+    Returns:
+        one effect a row, with the columns `COLUMNS`: `low` and `high` are the ends of the interval
+        over images and seeds, `p_holm` is corrected for the main effects, or the interactions, of a
+        method, `shown` says whether the effect differs from 0 by it, errors are standard errors.
+        And a sentence on each method that lacks runs. Both are empty without a design.
     """
-
-    frame: pd.DataFrame
-    missing: tuple[str, ...]
-
-
-def effects_of(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> Effects:
-    """Every effect on a method that finished runs allow, and its difference to that on another."""
     import pandas as pd
 
-    design, labels = judge.table.design, {row.label for row in judge.table.rows}
-    assert design is not None, "effects are those of a design"
     rows: list[dict[str, Any]] = []
-    missing: dict[str, None] = {}
+    lacking: list[str] = []
+    design = judged.request.table.design
+    if design is None:
+        return pd.DataFrame(columns=list(COLUMNS)), []
+    labels = {row.label for row in judged.request.table.rows}
     for part, outcome, method in product(design.parts, design.outcomes, design.methods):
         if labels.isdisjoint(row for row, _ in design.places(part, method.name)):
             continue  # rows=... left it out
         try:
-            own = _cells(judge, part, method.name, outcome, runs)
-            found = {"": _evidence(judge, own, _common(own))}
+            own = _cells(judged, design, part, method.name, outcome)
+            evidences = _evidences(judged, own, _common_seeds(own))
         except InputError as error:
-            missing[f"{part}, {method.name}: {error}"] = None
+            lacking.append(f"{part}, {method.name}: {error}")
+            continue
+        start = {"part": part, "outcome": outcome, "method": method.name}
+        rows += _lines({**start, "against": ""}, design, evidences)
+        if method.against is None:
             continue
         try:
-            other = _cells(judge, part, method.against or "", outcome, runs)
-            seeds = _common([*own, *other])
-            sides = (_evidence(judge, each, seeds) for each in (own, other))
-            differences = [combine((1.0, -1.0), pair) for pair in zip(*sides, strict=True)]
-            found[method.against or ""] = differences
+            other = _cells(judged, design, part, method.against, outcome)
+            differences = _differences(judged, own, other)
         except InputError:  # its missing runs are named with that method
-            pass
-        for against, cells in found.items():
-            place = {"part": part, "outcome": outcome, "method": method.name, "against": against}
-            rows += [{**place, **each} for each in _lines(design, part, against, cells)]
-    return Effects(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(missing))
+            continue
+        rows += _lines({**start, "against": method.against}, design, differences)
+    return pd.DataFrame(rows, columns=list(COLUMNS)), list(dict.fromkeys(lacking))
 
 
 def _cells(
-    judge: TableJudge, part: str, method: str, outcome: str, runs: Mapping[CellRunId, Outcome]
+    judged: JudgedTable, design: Design, part: str, method: str, outcome: str
 ) -> list[list[Term]]:
     """The scores of the outcome in every cell; InputError where a cell has none."""
-    assert judge.table.design is not None, "cells are those of a design"
-    places = judge.table.design.places(part, method)
-    return [judge.terms([Cell(1.0, row, outcome, world)], runs) for row, world in places]
+    places = design.places(part, method)
+    return [judged.terms([Cell(1.0, row, outcome, world)]) for row, world in places]
 
 
-def _common(cells: Sequence[Sequence[Term]]) -> list[int]:
-    """Seeds that every cell has."""
+def _common_seeds(cells: Sequence[Sequence[Term]]) -> list[int]:
+    """The seeds that every cell has."""
     shared = set.intersection(*(set(term.counts) for cell in cells for term in cell))
     if not shared:
         raise InputError("its cells have no seed in common; train the same seeds of each cell.")
     return sorted(shared)
 
 
-def _evidence(
-    judge: TableJudge, cells: Sequence[Sequence[Term]], seeds: Sequence[int]
+def _evidences(
+    judged: JudgedTable, cells: Sequence[Sequence[Term]], seeds: Sequence[int]
 ) -> list[Evidence]:
-    return [
-        judge.worlds.evidence(
-            [
-                replace(
-                    term,
-                    counts={seed: term.counts[seed] for seed in seeds},
-                    keys={seed: term.keys[seed] for seed in seeds},
-                )
-                for term in cell
-            ]
-        )
-        for cell in cells
-    ]
+    """The evidence about every cell, by these seeds alone."""
+    evidences = []
+    for cell in cells:
+        terms = []
+        for term in cell:
+            counts = {seed: term.counts[seed] for seed in seeds}
+            keys = {seed: term.keys[seed] for seed in seeds}
+            terms.append(replace(term, counts=counts, keys=keys))
+        evidences.append(judged.resampler("names").evidence(terms))
+    return evidences
+
+
+def _differences(
+    judged: JudgedTable, own: Sequence[Sequence[Term]], other: Sequence[Sequence[Term]]
+) -> list[Evidence]:
+    """The evidence about one method less another in every cell, by the seeds of both."""
+    seeds = _common_seeds([*own, *other])
+    pairs = zip(_evidences(judged, own, seeds), _evidences(judged, other, seeds), strict=True)
+    return [combine((1.0, -1.0), pair) for pair in pairs]
 
 
 def _lines(
-    design: Design, part: str, against: str, cells: Sequence[Evidence]
-) -> Iterator[dict[str, Any]]:
+    start: dict[str, Any], design: Design, cells: Sequence[Evidence]
+) -> list[dict[str, Any]]:
     """The mean of all cells, then every effect; p-values are corrected within each family."""
+    part = start["part"]
     levels, groups = design.cells(part), design.effects(part)
     firsts = [next(iter(effects)) for effects in groups.values()]
     mains = sum(len(first) == 1 for first in firsts)
-    found = estimate_effects(cells, np.ones((1, len(levels))), NOISE[part])
-    for family in filter(None, (firsts[:mains], firsts[mains:])):
-        signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
-        found += estimate_effects(cells, signs, NOISE[part])
-    for name, each in zip((MEAN, *groups), found, strict=True):
-        estimate, evidence = each.estimate, each.estimate.evidence
-        around = estimate.both
-        ends = (math.nan,) * 3 if around is None else (around.low, around.high, estimate.p)
-        yield {
-            "effect": name,
-            **dict(zip(NUMBERS, (estimate.value, *ends, each.corrected), strict=True)),
-            "shown": ABSENT if name == MEAN and not against else _word(each),
-            "error_seeds": evidence.trainings.error if evidence.trainings else math.nan,
-            "error_images": evidence.error,
-            "seeds": estimate.seeds,
-            "cells": len(levels),
-        }
+    estimated = estimate_effects(cells, np.ones((1, len(levels))), NOISE[part])
+    for family in (firsts[:mains], firsts[mains:]):
+        if family:
+            signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
+            estimated += estimate_effects(cells, signs, NOISE[part])
+    lines = []
+    for name, effect in zip((MEAN, *groups), estimated, strict=True):
+        estimate, evidence = effect.estimate, effect.estimate.evidence
+        interval, trainings = estimate.both, evidence.trainings
+        is_plain_mean = name == MEAN and not start["against"]
+        lines.append(
+            {
+                **start,
+                "effect": name,
+                "value": estimate.value,
+                "low": math.nan if interval is None else interval.low,
+                "high": math.nan if interval is None else interval.high,
+                "p": math.nan if interval is None else estimate.p,
+                "p_holm": effect.corrected,
+                "shown": ABSENT if is_plain_mean else _word(effect),
+                "error_seeds": trainings.error if trainings else math.nan,
+                "error_images": evidence.error,
+                "seeds": estimate.seeds,
+                "cells": len(levels),
+            }
+        )
+    return lines
 
 
 def _word(effect: Effect) -> str:

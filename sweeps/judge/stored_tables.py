@@ -1,152 +1,63 @@
-"""Finished runs as rows of tables: which tables were run and how, and what their runs show."""
+"""Tables that were run: which rows finished runs belong to, by their keys and their tags."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import NamedTuple, cast, get_args
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+from typing import cast, get_args
 
 from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.compose import available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
-from rgbt.runs.run_spec import RunSpec
-from sweeps.judge.effects import Effects, effects_of
-from sweeps.judge.judged_table import (
-    RESAMPLES,
-    CellRunId,
-    JudgedClaim,
-    StoredRuns,
-    TableJudge,
-    rule_of,
-)
+from sweeps.judge.judged_table import RESAMPLES, JudgedTable
+from sweeps.judge.reader import ODD, SEED, RunReader
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, TableRequest
+from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, RowSeed, TableRequest
 from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
 from sweeps.point import Outcome, Point
-from sweeps.score.cells import ScoredTable, score, size_marks
 from sweeps.score.efficiency import network_sizes
 
-SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+# How a table was run: scale, form, and the words that were typed for every row.
+Variant = tuple[str, Form, tuple[str, ...]]
 
-# Errors that the tags of a run may raise that somebody has edited.
-ODD = (InputError, KeyError, ValueError, TypeError)
-
-
-class FinishedRuns:
-    """Finished runs by seed and key, and the seeds of experiments; one that is odd is a remark."""
-
-    def __init__(self, runs: Iterable[RunResult]) -> None:
-        self.by_seed: dict[int, dict[str, RunResult]] = {}
-        self.seeds: dict[str, set[int]] = {}
-        self.remarks: list[str] = []
-        for run in runs:
-            try:
-                seed, experiment = int(run.tags[SEED]), run.tags[EXPERIMENT]
-                self.by_seed.setdefault(seed, {})[run.key] = run
-                self.seeds.setdefault(experiment, set()).add(seed)
-            except ODD as error:
-                self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
-
-    def run_of(self, spec: RunSpec) -> RunResult | None:
-        """The run of a specification (`RunSpec.is_run`)."""
-        return next((run for run in self.by_seed[spec.seed].values() if spec.is_run(run)), None)
-
-    def __iter__(self) -> Iterator[RunResult]:
-        return (run for by_key in self.by_seed.values() for run in by_key.values())
+# Table and variant -> label of a row, the digest of the settings of the row alone when it was
+# requested, and the run that was requested for it.
+Requested = dict[tuple[str, Variant], list[tuple[str, str, RunResult]]]
 
 
-def stored_runs(
-    request: TableRequest, finished: FinishedRuns, planner: Planner, *, checked: bool = False
-) -> dict[CellRunId, Outcome]:
-    """The finished runs of every row; rows that cannot be composed have none.
+def runs_of_request(
+    request: TableRequest, reader: RunReader, planner: Planner, *, checked: bool = False
+) -> dict[RowSeed, Outcome]:
+    """Return the finished runs of every row by their keys; rows that cannot be composed have none.
 
     A row is composed if a finished run is of its experiment, or if its settings are `checked`.
     InputError: no row can be composed.
     """
-    runs: dict[CellRunId, Outcome] = {}
-    errors, rows = [], request.trained_rows
-    for row in rows:
+    runs: dict[RowSeed, Outcome] = {}
+    errors = []
+    for row in request.trained_rows:
         words = request.overrides(row.label, 0)
-        seeds = finished.seeds.get(words[0].removeprefix("+experiment="), set())
+        seeds = reader.seeds.get(words[0].removeprefix("+experiment="), set())
         if not checked and not seeds:
             continue
         try:
             spec = planner.specify((*planner.base, *words), checked=checked)
-            found = {seed: finished.run_of(spec.with_seed(seed)) for seed in sorted(seeds)}
+            found = {seed: reader.find(spec.with_seed(seed)) for seed in sorted(seeds)}
         except InputError as error:
             errors.append(error)
             continue
         for seed, run in found.items():
             if run is not None:
-                runs[row.label, seed] = Outcome(Point(row.label, ()), "finished", results=(run,))
-    if errors and len(errors) == len(rows):
+                runs[row.label, seed] = _finished(row.label, run)
+    if errors and len(errors) == len(request.trained_rows):
         raise errors[0]  # the command is wrong, and not a row
     return runs
 
 
-@dataclass(frozen=True)
-class TableResult:
-    """What the finished runs of a table show; `words` were typed for every row, as they tell."""
-
-    request: TableRequest
-    runs: Mapping[CellRunId, Outcome]
-    judge: TableJudge
-    words: tuple[str, ...] = ()
-
-    @cached_property
-    def scored(self) -> ScoredTable:
-        """Our values, with marks of the best rows."""
-        request, judge, runs = self.request, self.judge, self.runs
-        reader = judge.stored.counts
-        scored = score(
-            request.name, request.table, runs, scale=request.scale, sizes=judge.sizes, reader=reader
-        )
-        marks = judge.marks(scored, runs) | size_marks(request.table, judge.sizes)
-        return replace(scored, form=request.form, marks=marks)
-
-    @cached_property
-    def claims(self) -> list[JudgedClaim]:
-        """The claims of the table, judged."""
-        return self.judge.claims(self.runs)
-
-    @cached_property
-    def effects(self) -> Effects | None:
-        """The effects of the factors of its design; None where it has none."""
-        return None if self.request.table.design is None else effects_of(self.judge, self.runs)
-
-
-class Variant(NamedTuple):
-    """How a table was run; `words` were typed for every row."""
-
-    scale: str = DEFAULT_SCALE
-    form: Form = "paper"
-    words: tuple[str, ...] = ()
-
-
-def _requested_rows(
-    run: RunResult, tables: Collection[str]
-) -> Iterator[tuple[str, Variant, str, str]]:
-    """Table, variant, label and digest of every row that the tags of a run name; raises `ODD`."""
-    for tag, labels in run.tags.items():
-        name = tag.removeprefix(TAG)
-        if tag == name or name not in tables:
-            continue
-        form, digest, *words = shlex.split(run.tags.get(REQUESTED + name, "paper ''"))
-        check_words(words, f"the tag {REQUESTED}{name}")
-        scale = run.settings["scale"]["name"]
-        check_choice("form", form, get_args(Form))
-        check_choice("scale", scale, available("scale"))
-        for label in labels.split(" | "):
-            own = label.removesuffix(RELEASED)
-            way = form if own == label else "released"
-            yield name, Variant(scale, cast(Form, way), tuple(words)), own, digest
-
-
 def known_tables(remarks: list[str]) -> dict[str, Table]:
-    """All tables of the papers, of ours, and of the user; one that is not read is a remark."""
+    """Read all tables of the papers, of ours, and of the user; one that is not read is a remark."""
     tables = {}
     for name in dict.fromkeys([*table_names(), *study_names()]):
         try:
@@ -156,103 +67,107 @@ def known_tables(remarks: list[str]) -> dict[str, Table]:
     return tables
 
 
-@dataclass
-class TableResults:
-    """The results of tables.
+def judged_tables(
+    reader: RunReader,
+    planner: Planner,
+    tables: Mapping[str, Table],
+    remarks: list[str],
+    *,
+    resamples: int = RESAMPLES,
+    counted: bool = False,
+) -> Iterator[JudgedTable]:
+    """Judge tables with runs in every way that they were run, then those without a run.
 
-    Attributes:
-        finished: the runs; a run belongs to every table with a row of its key.
-        counted: whether the sizes of networks are counted, which needs torch.
-        remarks: what cannot be read or composed, one sentence each.
+    A run belongs to every table with a row of its key, so that a way without further words is tried
+    for each table. Sizes of networks are counted where `counted`, which needs torch. What cannot
+    be read or composed is added to `remarks`, one sentence each.
     """
-
-    finished: FinishedRuns
-    planner: Planner
-    tables: Mapping[str, Table] = field(default_factory=dict)
-    resamples: int = RESAMPLES
-    counted: bool = False
-    remarks: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.stored = StoredRuns()
-        self.remarks += self.finished.remarks
-
-    @cached_property
-    def requested(self) -> dict[tuple[str, Variant], list[tuple[str, str, RunResult]]]:
-        """Table and variant -> label of a row, its digest, and the run that was requested for it.
-
-        The digest is that of the settings of the row alone, when it was requested.
-        """
-        found: dict[tuple[str, Variant], list[tuple[str, str, RunResult]]] = {}
-        for run in self.finished:
+    requested = _requested(reader, tables, remarks)
+    shared = {variant for _, variant in requested if not variant[2]}
+    without_runs = []
+    for name, table in tables.items():
+        own = {variant for requested_table, variant in requested if requested_table == name}
+        is_run = False
+        for scale, form, words in sorted(own | shared):
+            request = TableRequest(name, table, scale, (0,), words, form=form)
+            rows = requested.get((name, (scale, form, words)), [])
             try:
-                for name, variant, label, digest in _requested_rows(run, self.tables):
-                    found.setdefault((name, variant), []).append((label, digest, run))
-            except ODD as error:
-                self.remarks.append(f"Run {run.key} belongs to no table: {one_line(error)}.")
-        return found
-
-    def of(self, name: str, variant: Variant | None = None) -> TableResult:
-        """The result of one table; without a variant it has no runs.
-
-        InputError: no row can be composed.
-        """
-        how = variant or Variant()
-        request = TableRequest(name, self.tables[name], how.scale, (0,), form=how.form)
-        if variant is None:
-            return self.result(request, {})
-        runs = self._by_tags(request, variant) if variant.words else None
-        return self.result(request, runs, words=variant.words)
-
-    def _by_tags(self, request: TableRequest, variant: Variant) -> dict[CellRunId, Outcome]:
-        """The runs with further words, which are not composed: of rows that are the same today."""
-        labels, runs = {row.label for row in request.trained_rows}, dict[CellRunId, Outcome]()
-        for label, before, run in self.requested[request.name, variant]:
-            digest = self.planner.row_digest(request.overrides(label, 0)) if label in labels else ""
-            if digest and digest == before:
-                outcome = Outcome(Point(label, ()), "finished", results=(run,))
-                runs[label, int(run.tags[SEED])] = outcome
-        return runs
-
-    def result(
-        self,
-        request: TableRequest,
-        runs: Mapping[CellRunId, Outcome] | None = None,
-        *,
-        words: tuple[str, ...] = (),
-        checked: bool = False,
-    ) -> TableResult:
-        """The result of a request by `runs`; None: by all finished ones, see `stored_runs`."""
-        if runs is None:
-            runs = stored_runs(request, self.finished, self.planner, checked=checked)
-        sizes = network_sizes(request) if self.counted and not words else {}
-        rule = rule_of(result for run in runs.values() for result in run.results)
-        name, table = request.name, request.table
-        judge = TableJudge(name, table, rule, self.resamples, sizes, self.stored)
-        return TableResult(request, runs, judge, words)
-
-    def __iter__(self) -> Iterator[TableResult]:
-        """Tables with runs in every way that they were run, then those without a run.
-
-        Tables share runs, so a way without further words is tried for each of them.
-        """
-        plain = {variant for _, variant in self.requested if not variant.words}
-        waiting = []
-        for name in self.tables:
-            own = {variant for table, variant in self.requested if table == name}
-            found = []
-            for variant in sorted(own | plain):
-                try:
-                    result = self.of(name, variant)
-                    _ = result.runs and (result.scored, result.claims)  # an error is a remark here
-                    found.append(result)
-                except InputError as error:
-                    self.remarks.append(f"Table '{name}' cannot be scored: {error}")
-            found = [result for result in found if result.runs]
-            yield from found
-            waiting += [] if found else [name]
-            if own and not found:
-                self.remarks.append(
-                    f"No run that is tagged with '{name}' has the key of a row today."
+                runs = _runs_of_variant(request, rows, reader, planner)
+                sizes = network_sizes(request) if counted and runs and not words else {}
+                judged = JudgedTable(
+                    request=request, runs=runs, sizes=sizes, resamples=resamples, reader=reader
                 )
-        yield from (self.of(name) for name in waiting)
+                _ = judged.scored, judged.claims  # an error is a remark here
+            except InputError as error:
+                remarks.append(f"Table '{name}' cannot be scored: {error}")
+                continue
+            if runs:
+                is_run = True
+                yield judged
+        if is_run:
+            continue
+        without_runs.append(name)
+        if own:
+            remarks.append(f"No run that is tagged with '{name}' has the key of a row today.")
+    for name in without_runs:
+        request = TableRequest(name, tables[name], DEFAULT_SCALE, (0,))
+        sizes = network_sizes(request) if counted else {}
+        yield JudgedTable(request=request, sizes=sizes, resamples=resamples, reader=reader)
+
+
+def _requested(reader: RunReader, tables: Collection[str], remarks: list[str]) -> Requested:
+    """What the tags of the runs say that they were requested for."""
+    requested: Requested = {}
+    for run in reader:
+        try:
+            for table, variant, label, digest in _requested_rows(run, tables):
+                requested.setdefault((table, variant), []).append((label, digest, run))
+        except ODD as error:
+            remarks.append(f"Run {run.key} belongs to no table: {one_line(error)}.")
+    return requested
+
+
+def _requested_rows(
+    run: RunResult, tables: Collection[str]
+) -> Iterator[tuple[str, Variant, str, str]]:
+    """Table, variant, label and digest of every row that the tags of a run name; raises `ODD`."""
+    tags = run.tags
+    for tag, labels in tags.items():
+        name = tag.removeprefix(TAG)
+        if tag == name or name not in tables:
+            continue
+        form, digest, *words = shlex.split(tags.get(REQUESTED + name, "paper ''"))
+        check_words(words, f"the tag {REQUESTED}{name}")
+        scale = run.settings["scale"]["name"]
+        check_choice("form", form, get_args(Form))
+        check_choice("scale", scale, available("scale"))
+        for label in labels.split(" | "):
+            own = label.removesuffix(RELEASED)
+            of_row = form if own == label else "released"
+            yield name, (scale, cast(Form, of_row), tuple(words)), own, digest
+
+
+def _runs_of_variant(
+    request: TableRequest,
+    rows: list[tuple[str, str, RunResult]],
+    reader: RunReader,
+    planner: Planner,
+) -> dict[RowSeed, Outcome]:
+    """The finished runs of a request; by tags, of rows that are the same today, where it has words.
+
+    Stored words are not composed.
+    """
+    if not request.extra:
+        return runs_of_request(request, reader, planner)
+    alone = replace(request, extra=())
+    labels = {row.label for row in request.trained_rows}
+    runs = {}
+    for label, before, run in rows:
+        digest = planner.row_digest(alone.overrides(label, 0)) if label in labels else ""
+        if digest and digest == before:
+            runs[label, int(run.tags[SEED])] = _finished(label, run)
+    return runs
+
+
+def _finished(label: str, run: RunResult) -> Outcome:
+    return Outcome(Point(label, ()), "finished", results=(run,))

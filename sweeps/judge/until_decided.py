@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, contrasts_of
-from sweeps.plan.request import TableRequest
+from sweeps.judge.contrasts import contrasts_of
+from sweeps.judge.judged_table import JudgedClaim, JudgedTable
+from sweeps.plan.request import RowSeed
 from sweeps.point import Outcome, Point
 
 # Seeds of every row before the claims are judged for the first time: with fewer, an interval that
@@ -27,45 +28,58 @@ class SeedsUntilDecided:
     """The further points of a table.
 
     Attributes:
-        judge: with a rule that is valid at any time.
+        judged: the table, without runs.
         max_seeds: most seeds of a row.
         external: runs of rows that are not trained.
     """
 
-    request: TableRequest
-    judge: TableJudge
+    judged: JudgedTable
     max_seeds: int
-    external: Mapping[CellRunId, Outcome] = field(default_factory=dict)
-    _seen: frozenset[CellRunId] | None = field(default=None, init=False)
+    external: Mapping[RowSeed, Outcome] = field(default_factory=dict)
+    _seen: frozenset[RowSeed] | None = field(default=None, init=False)
 
     def __call__(self, outcomes: Sequence[Outcome]) -> list[Point]:
-        """The next seed of the rows of every undecided claim; [] where nothing has changed.
+        """Return the next seed of the rows of every undecided claim; [] where nothing has changed.
 
         It is the lowest one that some of these rows lack, for each of them. They get it while at
         most one of their seeds is unfinished: no worker is idle, and few runs are made that turn
         out to be unnecessary. Rows of a claim with a failed run get no seeds.
         `outcomes` are those of all points until now.
         """
-        runs = self.request.runs(outcomes)
-        finished = frozenset(each for each, run in runs.items() if run.state == "finished")
+        request = self.judged.request
+        runs = request.runs(outcomes)
+        finished = frozenset(run for run, outcome in runs.items() if outcome.state == "finished")
         if finished == self._seen:
             return []
         self._seen = finished
-        wanted: dict[CellRunId, None] = {}
-        for judged in self.judge.claims({**runs, **self.external}):
-            contrasts = contrasts_of(judged.claim, self.request.table)
-            named = {label for each in contrasts for label in each.rows}
-            labels = [row.label for row in self.request.trained_rows if row.label in named]
-            own = {each: run for each, run in runs.items() if each[0] in labels}
-            unfinished = {seed for (_, seed), run in own.items() if run.state != "finished"}
-            is_failed = any(run.state == "failed" for run in own.values())
-            if is_failed or len(unfinished) > 1 or not _is_open(judged):
-                continue
-            every = ([(label, seed) for label in labels] for seed in range(self.max_seeds))
-            lacking = ([each for each in row if each not in own] for row in every)
-            wanted |= dict.fromkeys(next(filter(None, lacking), []))
-        have = {outcome.point.overrides for outcome in outcomes}
-        return [each for each in self.request.points(list(wanted)) if each.overrides not in have]
+        wanted: dict[RowSeed, None] = {}
+        for judged in replace(self.judged, runs={**runs, **self.external}).claims:
+            if _is_open(judged):
+                wanted |= dict.fromkeys(self._next_runs(judged, runs))
+        known = {outcome.point.overrides for outcome in outcomes}
+        points = request.points(list(wanted))
+        return [point for point in points if point.overrides not in known]
+
+    def _next_runs(self, judged: JudgedClaim, runs: Mapping[RowSeed, Outcome]) -> list[RowSeed]:
+        """The runs of the lowest seed that a row of an open claim lacks; [] where it must wait."""
+        request = self.judged.request
+        named: set[str] = set()
+        for contrast in contrasts_of(judged.claim, request.table):
+            named |= contrast.rows
+        labels = [row.label for row in request.trained_rows if row.label in named]
+        unfinished: set[int] = set()
+        for (label, seed), outcome in runs.items():
+            if label in labels and outcome.state == "failed":
+                return []
+            if label in labels and outcome.state != "finished":
+                unfinished.add(seed)
+        if len(unfinished) > 1:
+            return []
+        for seed in range(self.max_seeds):
+            lacking = [(label, seed) for label in labels if (label, seed) not in runs]
+            if lacking:
+                return lacking
+        return []
 
 
 def _is_open(judged: JudgedClaim) -> bool:
@@ -75,9 +89,9 @@ def _is_open(judged: JudgedClaim) -> bool:
     estimate of `HOPELESS` seeds says that no affordable number of seeds decides it. To stop for
     such a reason cannot make a verdict wrong.
     """
-    found = judged.verdict
-    if found is None or judged.word != "undecided" or not judged.complete:
+    verdict = judged.verdict
+    if verdict is None or judged.word != "undecided" or not judged.complete:
         return False
-    if found.seeds >= START and found.interval is None:
+    if verdict.seeds >= START and verdict.interval is None:
         return False
-    return found.seeds < HOPELESS or math.isfinite(found.seeds_needed)
+    return verdict.seeds < HOPELESS or math.isfinite(verdict.seeds_needed)

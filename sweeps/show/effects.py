@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable, number
-from sweeps.judge.effects import MEAN, Effects
+from sweeps.judge.effects import MEAN
 from sweeps.plan.design import TESTED, TRAINED, Design
 
 if TYPE_CHECKING:
@@ -38,40 +39,62 @@ NOTES = (
 SPAN = 0.62
 
 
-def effects_grids(effects: Effects, design: Design) -> list[TextTable]:
-    """One grid for each part and outcome; the factors and what is missing below the last."""
-    grids = []
-    levels = [f"{f.letter}, {f.name}: - {f.low_means}; + {f.high_means}." for f in design.factors]
-    for (part, outcome), each in effects.frame.groupby(["part", "outcome"], sort=False):
-        rows = []
-        for line in each.itertuples():
-            method = f"{line.method} - {line.against}" if line.against else line.method
-            interval = ABSENT if math.isnan(line.low) else f"[{line.low:+.2f}, {line.high:+.2f}]"
-            errors = (number(line.error_seeds), number(line.error_images))
-            difference = f"{line.value:+.2f}"
-            last = (line.shown, *errors, str(line.seeds))
-            rows.append((method, line.effect, difference, interval, *last))
-        grids.append(TextTable(f"Effects on {outcome}, {ASKS[part]}", HEADER, tuple(rows)))
-    if not grids and not effects.missing:
-        return []
-    last_grid = grids.pop() if grids else TextTable("Effects", HEADER, ())
-    notes = (*(*levels, *NOTES) * bool(last_grid.rows), *effects.missing)
-    return [*grids, TextTable(last_grid.title, HEADER, last_grid.rows, notes)]
+def effects_grids(frame: pd.DataFrame, lacking: Sequence[str], design: Design) -> list[TextTable]:
+    """Return one grid for each part and outcome of `sweeps.judge.effects.effects_of`.
+
+    The factors, and the methods that lack runs, are noted below the last.
+    """
+    titles, bodies = [], []
+    for (part, outcome), lines in frame.groupby(["part", "outcome"], sort=False):
+        titles.append(f"Effects on {outcome}, {ASKS[part]}")
+        bodies.append(tuple(_grid_row(line) for _, line in lines.iterrows()))
+    notes: list[str] = []
+    if bodies:
+        for factor in design.factors:
+            levels = f"- {factor.low_means}; + {factor.high_means}."
+            notes.append(f"{factor.letter}, {factor.name}: {levels}")
+        notes += NOTES
+    elif lacking:
+        titles, bodies = ["Effects"], [()]
+    notes += lacking
+    last = len(bodies) - 1
+    return [
+        TextTable(title, HEADER, rows, tuple(notes) if place == last else ())
+        for place, (title, rows) in enumerate(zip(titles, bodies, strict=True))
+    ]
 
 
-def effects_figure(effects: Effects, name: str) -> Figure | None:
-    """A row of panels for each part, one panel per outcome; filled markers: shown to differ from 0.
+def _grid_row(line: pd.Series) -> tuple[str, ...]:
+    interval = ABSENT
+    if not math.isnan(line["low"]):
+        interval = f"[{line['low']:+.2f}, {line['high']:+.2f}]"
+    return (
+        f"{line['method']} - {line['against']}" if line["against"] else line["method"],
+        line["effect"],
+        f"{line['value']:+.2f}",
+        interval,
+        line["shown"],
+        number(line["error_seeds"]),
+        number(line["error_images"]),
+        str(line["seeds"]),
+    )
+
+
+def effects_figure(frame: pd.DataFrame, name: str) -> Figure | None:
+    """Draw a row of panels for each part, one panel per outcome.
+
+    Filled markers are shown to differ from 0. `frame` is that of `sweeps.judge.effects.effects_of`.
 
     Returns:
         None where no effect has an interval.
     """
     from matplotlib.figure import Figure
 
-    frame = effects.frame
     frame = frame[(frame["against"] == "") & (frame["effect"] != MEAN) & frame["low"].notna()]
     if frame.empty:
         return None
     parts, outcomes = frame["part"].unique(), frame["outcome"].unique()
+    methods = list(frame["method"].unique())
     heights = [frame[frame["part"] == part]["effect"].nunique() for part in parts]
     size = (2.6 + 2.9 * len(outcomes), 1.3 + 0.42 * sum(heights))
     figure = Figure(figsize=size, layout="constrained")
@@ -81,7 +104,7 @@ def effects_figure(effects: Effects, name: str) -> Figure | None:
     for row, part in zip(panels, parts, strict=True):
         for axes, outcome in zip(row, outcomes, strict=True):
             chosen = (frame["part"] == part) & (frame["outcome"] == outcome)
-            _panel(axes, frame[chosen], list(frame["method"].unique()))
+            _panel(axes, frame[chosen], methods)
             axes.set_title(outcome, fontsize=9)
         row[0].set_ylabel(ASKS[part], fontsize=8)
     figure.suptitle(f"{name}: effects with 95 % intervals", fontsize=10)
@@ -98,10 +121,10 @@ def _panel(axes: Axes, lines: pd.DataFrame, methods: list[str]) -> None:
     for place, method in enumerate(methods):
         own = lines[lines["method"] == method]
         shift = SPAN * ((place + 0.5) / len(methods) - 0.5)
-        at = [effects.index(each) + shift for each in own["effect"]]
+        at = [effects.index(effect) + shift for effect in own["effect"]]
         colour = series_style(place)["color"]
         halves = (own["high"] - own["low"]) / 2
-        faces = [colour if each in ("higher", "lower") else "white" for each in own["shown"]]
+        faces = [colour if word in ("higher", "lower") else "white" for word in own["shown"]]
         axes.errorbar(
             own["value"], at, xerr=halves, fmt="none", ecolor=colour, elinewidth=1, capsize=2
         )

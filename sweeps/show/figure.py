@@ -27,13 +27,16 @@ SHIFT = 0.13
 
 
 def figure_of(scored: ScoredTable) -> Figure | None:
-    """The figure; None where there is no value at all."""
+    """Draw the values of the main columns; None where there is no value at all."""
     from analysis.figures.plots import new_figure
 
     rows = scored.table.rows
     values = {column.name: _values(scored, column) for column in scored.table.columns}
-    columns = [each for each in scored.table.columns if not np.isnan(values[each.name]).all()]
-    shown = [each for each in scored.table.headlines() if each in columns][:MAX_HEADLINES]
+    columns = []
+    for column in scored.table.columns:
+        if not np.isnan(values[column.name]).all():
+            columns.append(column)
+    shown = [column for column in scored.table.headlines() if column in columns][:MAX_HEADLINES]
     shown = shown or columns[:MAX_PANELS]
     if not shown:
         return None
@@ -63,8 +66,10 @@ def figure_of(scored: ScoredTable) -> Figure | None:
 
 def _values(scored: ScoredTable, column: Column) -> Values:
     """(3, R) mean and standard deviation of ours, and published value, of every row; NaN: none."""
-    nothing, found = TableCell(math.nan, math.nan, 0), []
+    nothing = TableCell(math.nan, math.nan, 0)
+    values = []
     for row in scored.table.rows:
-        cell, printed = scored.cells.get((row.label, column.name), nothing), published(row, column)
-        found.append((cell.mean, cell.sd, math.nan if printed is None else printed))
-    return np.array(found, np.float64).T
+        cell = scored.cells.get((row.label, column.name), nothing)
+        printed = published(row, column)
+        values.append((cell.mean, cell.sd, math.nan if printed is None else printed))
+    return np.array(values, np.float64).T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rgbt.metrics import names
 from rgbt.tables import ABSENT, TextTable, number
@@ -13,7 +13,7 @@ MOST_REGIONS = 99
 
 
 def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
-    """Scores on the test split by configuration.
+    """Return the scores on the test split by configuration.
 
     Returns:
         columns: configuration, seeds that went into the row ("2 of 3" where some are missing),
@@ -21,47 +21,68 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
         alone, and of configurations of one run each the key of that run.
     """
     groups: dict[str, list[Outcome]] = {}
-    scores = {}
     for outcome in outcomes:
-        members = groups.setdefault(_configuration(outcome.point), [])
+        group = groups.setdefault(_configuration(outcome.point), [])
         # A seed that was typed twice is one run.
-        if not outcome.keys or all(each.keys != outcome.keys for each in members):
-            members.append(outcome)
-        is_finished = outcome.state == "finished" and outcome.results
-        scores[id(outcome)] = outcome.results[0].recorded_scores() if is_finished else {}
-    known = {name for each in scores.values() for name in each}
-    regions = map(names.region, range(1, MOST_REGIONS))
-    metrics = [names.MIOU, names.VAR, *(name for name in regions if f"test/{name}" in known)]
-    has_seeds = any(len(members) > 1 for members in groups.values())
+        if not outcome.keys or outcome.keys not in [member.keys for member in group]:
+            group.append(outcome)
+    scores = {label: [_scores(member) for member in group] for label, group in groups.items()}
+    metrics = [names.MIOU, names.VAR]
+    for region in range(1, MOST_REGIONS):
+        name = names.region(region)
+        if any(f"test/{name}" in seed for seeds in scores.values() for seed in seeds):
+            metrics.append(name)
+    has_seeds = any(len(group) > 1 for group in groups.values())
+    header = ["configuration", "seeds", *metrics]
+    if not has_seeds:
+        header.append("run")
     rows = []
-    for label, members in groups.items():
-        tested = [scores[id(each)] for each in members]
-        cells = [
-            over_seeds({n: each.get(f"test/{metric}", "not run") for n, each in enumerate(tested)})
-            for metric in metrics
-        ]
-        count = cells[0].seeds
-        seeds = f"{count} of {len(members)}" if count < len(members) else str(count)
-        spreads = (f" ± {number(cell.sd)}" if cell.seeds > 1 else "" for cell in cells)
-        shown = (f"{number(cell.mean)}{s}" for cell, s in zip(cells, spreads, strict=True))
-        beside = [] if has_seeds else [" ".join(members[0].keys) or ABSENT]
-        rows.append((label, seeds, *shown, *beside))
-    header = ("configuration", "seeds", *metrics, *([] if has_seeds else ["run"]))
-    return TextTable(title, header, tuple(rows))
+    for label, group in groups.items():
+        row = [label, *_group_cells(scores[label], metrics)]
+        if not has_seeds:
+            row.append(" ".join(group[0].keys) or ABSENT)
+        rows.append(tuple(row))
+    return TextTable(title, tuple(header), tuple(rows))
+
+
+def _scores(outcome: Outcome) -> Mapping[str, float]:
+    """The scores of a point by name; empty where it has none."""
+    is_finished = outcome.state == "finished" and outcome.results
+    return outcome.results[0].recorded_scores() if is_finished else {}
+
+
+def _group_cells(seeds: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> list[str]:
+    """The number of seeds, then the mean and spread of every metric."""
+    texts = []
+    count = 0
+    for place, metric in enumerate(metrics):
+        by_seed = {n: scores.get(f"test/{metric}", "not run") for n, scores in enumerate(seeds)}
+        cell = over_seeds(by_seed)
+        if place == 0:
+            count = cell.seeds
+        spread = f" ± {number(cell.sd)}" if cell.seeds > 1 else ""
+        texts.append(f"{number(cell.mean)}{spread}")
+    return [f"{count} of {len(seeds)}" if count < len(seeds) else str(count), *texts]
 
 
 def unfinished_grid(outcomes: Sequence[Outcome]) -> TextTable:
-    """Points without a result and why; no rows where all are finished."""
-    rows = tuple(
-        (each.point.label, each.state, " ".join(each.keys) or ABSENT, each.reason)
-        for each in outcomes
-        if each.state != "finished"
-    )
-    return TextTable("Points without a result", ("point", "state", "run", "reason"), rows)
+    """Return the points without a result, and why; no rows where all are finished."""
+    rows = []
+    for outcome in outcomes:
+        if outcome.state != "finished":
+            key = " ".join(outcome.keys) or ABSENT
+            rows.append((outcome.point.label, outcome.state, key, outcome.reason))
+    header = ("point", "state", "run", "reason")
+    return TextTable("Points without a result", header, tuple(rows))
 
 
 def _configuration(point: Point) -> str:
     """The label of a point without its seed, else its experiment."""
     label = " ".join(word for word in point.label.split(" ") if not word.startswith("seed="))
-    named = (word.partition("=") for word in point.overrides)
-    return label or next((value for key, _, value in named if key == "+experiment"), ABSENT)
+    if label:
+        return label
+    for word in point.overrides:
+        key, _, value = word.partition("=")
+        if key == "+experiment":
+            return value
+    return ABSENT

@@ -6,18 +6,11 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal
 
 from rgbt.tables import ABSENT, TextTable, csv_text
-from sweeps.plan.table import Column, Form, Row, is_counted, metric_of
-from sweeps.score.cells import (
-    NO_VALUE,
-    ScoredTable,
-    TableCell,
-    is_of_runs,
-    published,
-)
+from sweeps.plan.table import Column, Form, Row, Table, is_counted, metric_of
+from sweeps.score.cells import NO_VALUE, ScoredTable, TableCell, is_of_runs, published
 from sweeps.score.efficiency import SCALE
 
 DOUBTFUL = "The printed value does not agree with the others of its row."
@@ -47,36 +40,42 @@ CSV_HEADER = (
     "runs",
 )
 
-
-class Style(NamedTuple):
-    """How the best and the second best of a column are marked, and what says so."""
-
-    marks: tuple[str, str, str]
-    legend: str
-
-
-TERMINAL = Style(("{}", "*{}", "_{}"), "*: shown to be the best of our rows, _: the second best.")
-MARKDOWN = Style(
-    ("{}", "**{}**", "*{}*"), "Bold: shown to be the best of our rows, italic: the second best."
-)
+Style = Literal["terminal", "markdown"]
+# How all other values, the best and the second best of a column are shown, and what says so.
+MARKS: dict[Style, tuple[str, str, str]] = {
+    "terminal": ("{}", "*{}", "_{}"),
+    "markdown": ("{}", "**{}**", "*{}*"),
+}
+LEGENDS: dict[Style, str] = {
+    "terminal": "*: shown to be the best of our rows, _: the second best.",
+    "markdown": "Bold: shown to be the best of our rows, italic: the second best.",
+}
 
 
 def render_table(
     scored: ScoredTable, style: Style, extra: Sequence[str] = (), remarks: Sequence[str] = ()
 ) -> TextTable:
-    """The grid of a table; `extra` are overrides of every row, `remarks` sentences below it."""
-    table, builder = scored.table, _Lines(scored, style)
-    title = builder.noted(f"{table.paper}, {table.number}: {table.caption}", *table.remarks)
-    header = builder.header()
-    rows = tuple(line for row in table.rows for line in builder.row(row))
-    notes = [f"[{index}] {note}" for index, note in enumerate(builder.sentences, start=1)]
-    legend = [style.legend] if scored.marks else []
-    below = (*notes, *_remarks(scored, extra), *remarks, *legend)
-    return TextTable(title, header, rows, below)
+    """Return the grid of a table; `extra` are overrides of every row, `remarks` end its notes."""
+    table = scored.table
+    footnotes: list[str] = []  # in the order of their first use
+    title = f"{table.paper}, {table.number}: {table.caption}"
+    title = _noted(title, table.remarks, footnotes)
+    header = ["", "", "seeds"]
+    for column in table.columns:
+        header.append(_noted(column.name, () if column.printed else (NOT_PRINTED,), footnotes))
+    rows: list[tuple[str, ...]] = []
+    for row in table.rows:
+        rows += _lines(scored, row, style, footnotes)
+    notes = [f"[{number}] {footnote}" for number, footnote in enumerate(footnotes, start=1)]
+    notes += _remarks(scored, extra)
+    notes += remarks
+    if scored.marks:
+        notes.append(LEGENDS[style])
+    return TextTable(title, tuple(header), tuple(rows), tuple(notes))
 
 
 def latex(grid: TextTable) -> str:
-    """The grid in LaTeX (booktabs), without lines of differences, which no paper has."""
+    """Return the grid in LaTeX (booktabs), without lines of differences, which no paper has."""
     import pandas as pd
 
     rows = [row for row in grid.rows if row[1] != "difference"]
@@ -86,20 +85,56 @@ def latex(grid: TextTable) -> str:
     return str(frame.to_latex(index=False, escape=True, caption=caption, column_format=sides))
 
 
+def tidy_csv(scored: ScoredTable) -> str:
+    """Return one line per row and column (`CSV_HEADER`), with all digits; empty: no value.
+
+    Values are in the unit of the table; `n` is the number of seeds, `runs` are keys of runs.
+    """
+    rows: list[tuple[object, ...]] = [CSV_HEADER]
+    nothing = TableCell(math.nan, math.nan, 0)
+    for row in scored.table.rows:
+        for column in scored.table.columns:
+            cell = scored.cells.get((row.label, column.name), nothing)
+            printed = published(row, column)
+            rows.append(
+                (
+                    scored.name,
+                    row.label,
+                    column.name,
+                    plain(cell.mean),
+                    plain(cell.sd),
+                    cell.seeds,
+                    "" if printed is None else printed,
+                    plain(scored.difference(row, column)),
+                    cell.reason,
+                    " ".join(cell.keys),
+                )
+            )
+    return csv_text(rows)
+
+
+def plain(value: float) -> str:
+    """Return a number for CSV; "" for NaN."""
+    return "" if math.isnan(value) else repr(round(value, 6))
+
+
 def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     """Sentences below the table."""
     table, seeds = scored.table, scored.seeds
     printed = any(row.values for row in table.rows)
-    remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
-    remarks += _lists(scored) if printed or scored.lists else []
+    remarks = []
+    if printed:
+        remarks.append(f"Published: {table.data}; {table.unit}.")
+    if printed or scored.lists:
+        remarks += _lists_of_paper(table) + _lists_of_runs(scored)
     if seeds:
-        listed, many = ", ".join(map(str, seeds)), len(seeds) > 1
-        over = "mean ± standard deviation (n - 1) over seeds" if many else "of seed"
-        remarks.append(f"Ours: scale={scored.scale}, {over} {listed}.")
+        over = "mean ± standard deviation (n - 1) over seeds" if len(seeds) > 1 else "of seed"
+        remarks.append(f"Ours: scale={scored.scale}, {over} {', '.join(map(str, seeds))}.")
     if scored.cells and printed:
         remarks.append(table.forms.get(scored.form, FORMS[scored.form]))
     sizes = {column.name for column in table.columns if column.efficiency is not None}
-    remarks += [COUNTED] if sizes & {name for _, name in scored.cells} else []
+    if any(name in sizes for _, name in scored.cells):
+        remarks.append(COUNTED)
     if seeds and scored.scale != "paper" and printed:
         remarks.append(SMALL.format(scale=scored.scale))
     if extra:
@@ -111,132 +146,128 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     return remarks
 
 
-def _lists(scored: ScoredTable) -> list[str]:
-    """Which lists the rows were trained and selected on; whether rows of ours differ in them."""
-    own = {row.label: row.lists for row in scored.table.rows if row.lists and row.values}
-    printed = [f"Lists of published rows: {scored.table.lists}."] if scored.table.lists else []
+def _lists_of_paper(table: Table) -> list[str]:
+    """Which lists the published rows were trained and selected on."""
+    remarks = []
+    if table.lists:
+        remarks.append(f"Lists of published rows: {table.lists}.")
+    own = [f"{row.label}: {row.lists}" for row in table.rows if row.lists and row.values]
     if own:
-        printed.append(f"{'; '.join(f'{label}: {text}' for label, text in own.items())}.")
+        remarks.append(f"{'; '.join(own)}.")
+    return remarks
+
+
+def _lists_of_runs(scored: ScoredTable) -> list[str]:
+    """Which lists our rows were trained and selected on, and whether they differ in them."""
     groups: dict[str, list[str]] = {}
     for label, text in scored.lists.items():
         groups.setdefault(text, []).append(label)
     if len(groups) < 2:
-        return [*printed, *(f"Lists of our rows: {text}." for text in groups)]
+        return [f"Lists of our rows: {text}." for text in groups]
     shown = "; ".join(f"{text} ({', '.join(labels)})" for text, labels in groups.items())
-    return [*printed, f"Our rows have different lists: {shown}."]
+    return [f"Our rows have different lists: {shown}."]
 
 
-@dataclass
-class _Lines:
-    """Makes the lines of a table; `sentences` are its footnotes in the order of their first use."""
-
-    scored: ScoredTable
-    style: Style
-    sentences: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        # Published values have as many decimals as the paper prints.
-        printed = [value for row in self.scored.table.rows for value in row.values.values()]
-        digits = [repr(value).partition(".")[2] for value in printed if value is not None]
-        self.decimals = max((len(each.rstrip("0")) for each in digits), default=2)
-
-    def noted(self, text: str, *sentences: str | None) -> str:
-        """A text with the numbers of its footnotes; the same sentence keeps its number."""
-        given = [sentence for sentence in sentences if sentence]
-        self.sentences += [one for one in dict.fromkeys(given) if one not in self.sentences]
-        return text + "".join(f"[{self.sentences.index(each) + 1}]" for each in given)
-
-    def header(self) -> tuple[str, ...]:
-        """The names of the columns, behind the label, the kind of line and the number of seeds."""
-        columns = self.scored.table.columns
-        own = (self.noted(each.name, "" if each.printed else NOT_PRINTED) for each in columns)
-        return ("", "", "seeds", *own)
-
-    def row(self, row: Row) -> list[tuple[str, ...]]:
-        """The lines of one row: ours, published, difference, as far as there are any."""
-        label = self.noted(row.label, self._same_runs(row), *(() if row.doubtful else row.remarks))
-        columns, cells = self.scored.table.columns, self.scored.cells
-        is_run = any((row.label, column.name) in cells for column in columns)
-        is_printed = any(published(row, column) is not None for column in columns)
-        both = any(not math.isnan(self.scored.difference(row, column)) for column in columns)
-        kinds = (
-            ("ours", self._ours, is_run),
-            ("published", self._published, is_printed or not is_run),
-            ("difference", self._difference, both),
-        )
-        lines: list[tuple[str, ...]] = []
-        for kind, text, is_shown in kinds:
-            if is_shown:
-                seeds = self._seeds(row) if kind == "ours" else ""
-                texts = (text(row, column) for column in columns)
-                lines.append(("" if lines else label, kind, seeds, *texts))
-        return lines
-
-    def _same_runs(self, row: Row) -> str | None:
-        """A note on an equal row: at scale=demo networks of all sizes are one."""
-        keys, rows = self._keys(row), self.scored.table.rows
-        counted = list(filter(is_counted, self.scored.table.columns))
-        metrics = [metric_of(column, row) for column in counted]
-        for other in rows[: rows.index(row)]:
-            is_same = metrics == [metric_of(column, other) for column in counted]
-            if keys and keys == self._keys(other) and is_same:
-                return f"At scale={self.scored.scale} the same runs as row '{other.label}'."
-        return None
-
-    def _keys(self, row: Row) -> tuple[str, ...]:
-        columns = self.scored.table.columns
-        cells = (self.scored.cells.get((row.label, column.name)) for column in columns)
-        return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
-
-    def _seeds(self, row: Row) -> str:
-        """How many seeds the row's values are means of."""
-        columns = filter(is_of_runs, self.scored.table.columns)
-        cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
-        there = [cell.seeds for cell in cells if cell is not None]
-        counts = sorted({seeds for seeds in there if seeds} or set(there))
-        return "-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:])))
-
-    def _ours(self, row: Row, column: Column) -> str:
-        cell_id = (row.label, column.name)
-        cell = self.scored.cells.get(cell_id)
-        if cell is None:
-            return ABSENT
-        text = f"{cell.mean:.2f}"
-        if math.isnan(cell.mean):
-            text = ABSENT if cell.mark == NO_VALUE else cell.mark
-        text += "" if math.isnan(cell.sd) else f" ± {cell.sd:.2f}"
-        marked = self.style.marks[self.scored.marks.get(cell_id, 0)].format(text)
-        return self.noted(marked, cell.reason and f"{cell.reason.removesuffix('.')}.")
-
-    def _published(self, row: Row, column: Column) -> str:
-        printed = published(row, column)
-        if printed is None:
-            return ABSENT
-        doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
-        return self.noted(f"{printed:.{self.decimals}f}", *doubts)
-
-    def _difference(self, row: Row, column: Column) -> str:
-        value = self.scored.difference(row, column)
-        return ABSENT if math.isnan(value) else f"{value:+.2f}"
+def _noted(text: str, notes: Sequence[str], footnotes: list[str]) -> str:
+    """A text with the numbers of its notes, of which new ones are added to the footnotes."""
+    for note in notes:
+        if note not in footnotes:
+            footnotes.append(note)
+        text += f"[{footnotes.index(note) + 1}]"
+    return text
 
 
-def tidy_csv(scored: ScoredTable) -> str:
-    """One line per row and column (`CSV_HEADER`), with all digits; empty where there is no value.
+def _lines(
+    scored: ScoredTable, row: Row, style: Style, footnotes: list[str]
+) -> list[tuple[str, ...]]:
+    """The lines of one row: ours, published, difference, as far as there are any."""
+    columns = scored.table.columns
+    notes = _same_runs(scored, row)
+    if not row.doubtful:
+        notes += row.remarks
+    label = _noted(row.label, notes, footnotes)
+    lines = []
+    if any((row.label, column.name) in scored.cells for column in columns):
+        values = [_ours(scored, row, column, style, footnotes) for column in columns]
+        lines.append(("ours", _seeds(scored, row), *values))
+    if not lines or any(published(row, column) is not None for column in columns):
+        decimals = _decimals(scored.table)
+        values = [_published(row, column, decimals, footnotes) for column in columns]
+        lines.append(("published", "", *values))
+    differences = [scored.difference(row, column) for column in columns]
+    if not all(math.isnan(value) for value in differences):
+        values = [ABSENT if math.isnan(value) else f"{value:+.2f}" for value in differences]
+        lines.append(("difference", "", *values))
+    return [("" if place else label, *line) for place, line in enumerate(lines)]
 
-    Values are in the unit of the table; `n` is the number of seeds, `runs` are keys of runs.
+
+def _ours(scored: ScoredTable, row: Row, column: Column, style: Style, footnotes: list[str]) -> str:
+    cell = scored.cells.get((row.label, column.name))
+    if cell is None:
+        return ABSENT
+    text = f"{cell.mean:.2f}"
+    if math.isnan(cell.mean):
+        text = ABSENT if cell.mark == NO_VALUE else cell.mark
+    if not math.isnan(cell.sd):
+        text += f" ± {cell.sd:.2f}"
+    rank = scored.marks.get((row.label, column.name), 0)
+    notes = [f"{cell.reason.removesuffix('.')}."] if cell.reason else []
+    return _noted(MARKS[style][rank].format(text), notes, footnotes)
+
+
+def _published(row: Row, column: Column, decimals: int, footnotes: list[str]) -> str:
+    printed = published(row, column)
+    if printed is None:
+        return ABSENT
+    doubts: Sequence[str] = ()
+    if column.name in row.doubtful:
+        doubts = row.remarks or (DOUBTFUL,)
+    return _noted(f"{printed:.{decimals}f}", doubts, footnotes)
+
+
+def _decimals(table: Table) -> int:
+    """How many decimals the paper prints; 2 without printed values."""
+    decimals = []
+    for row in table.rows:
+        for value in row.values.values():
+            if value is not None:
+                decimals.append(len(repr(value).partition(".")[2].rstrip("0")))
+    return max(decimals, default=2)
+
+
+def _same_runs(scored: ScoredTable, row: Row) -> list[str]:
+    """A note on a row of the same runs as one before: at scale=demo networks of all sizes are one.
+
+    Its columns must have the same metrics too.
     """
-    rows: list[tuple[object, ...]] = [CSV_HEADER]
-    nothing = TableCell(math.nan, math.nan, 0)
-    for row in scored.table.rows:
-        for column in scored.table.columns:
-            cell = scored.cells.get((row.label, column.name), nothing)
-            printed, difference = published(row, column), scored.difference(row, column)
-            ours = (plain(cell.mean), plain(cell.sd), cell.seeds)
-            theirs = ("" if printed is None else printed, plain(difference), cell.reason)
-            rows.append((scored.name, row.label, column.name, *ours, *theirs, " ".join(cell.keys)))
-    return csv_text(rows)
+    keys, rows = _keys(scored, row), scored.table.rows
+    counted = [column for column in scored.table.columns if is_counted(column)]
+    metrics = [metric_of(column, row) for column in counted]
+    for other in rows[: rows.index(row)]:
+        is_same = metrics == [metric_of(column, other) for column in counted]
+        if keys and keys == _keys(scored, other) and is_same:
+            return [f"At scale={scored.scale} the same runs as row '{other.label}'."]
+    return []
 
 
-def plain(value: float | None) -> str:
-    """A number for CSV; "" for none."""
-    return "" if value is None or math.isnan(value) else repr(round(value, 6))
+def _keys(scored: ScoredTable, row: Row) -> tuple[str, ...]:
+    """The keys of the runs of a row."""
+    for column in scored.table.columns:
+        cell = scored.cells.get((row.label, column.name))
+        if cell is not None and cell.keys:
+            return cell.keys
+    return ()
+
+
+def _seeds(scored: ScoredTable, row: Row) -> str:
+    """How many seeds the row's values are means of: "3", or "2-3"."""
+    counts = set()
+    for column in scored.table.columns:
+        cell = scored.cells.get((row.label, column.name))
+        if cell is not None and is_of_runs(column):
+            counts.add(cell.seeds)
+    if not counts:
+        return ""
+    counts = counts - {0} or counts
+    low, high = min(counts), max(counts)
+    return str(low) if low == high else f"{low}-{high}"

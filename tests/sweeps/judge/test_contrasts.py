@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sweeps.judge.judged_table import (
+from sweeps.judge.contrasts import (
     Contrast,
     base_scores,
     contrasts_of,
@@ -45,7 +45,7 @@ def claim(**others: object) -> Claim:
     ],
 )
 def test_contrasts_of_a_claim(others: dict[str, object], labels: list[str]) -> None:
-    assert [each.label for each in contrasts_of(claim(**others), TABLE)] == labels
+    assert [contrast.label for contrast in contrasts_of(claim(**others), TABLE)] == labels
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from rgbt.metrics.counts import Counts
-from sweeps.judge.effects import MEAN, Effects, effects_of
-from sweeps.judge.judged_table import TableJudge
+from sweeps.judge.effects import MEAN, effects_of
 from sweeps.plan.claim import Claim
 from sweeps.plan.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.plan.table import Column, Row, Table, world_words
+from tests.sweeps.judge.accuracies import judged
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
@@ -33,21 +33,21 @@ def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Ta
         methods=(baseline, DesignMethod(name="crm", experiment="crm", against="baseline")),
         outcomes=("contrast",),
         trained=trained,
-        tested=tested,  # type: ignore[arg-type]
+        tested=tested,
     )
     columns = (
         Column(name="one", metric="region/1"),
         Column(name="two", metric="region/2"),
         Column(name="contrast", minus=("one", "two")),
     )
-    rows = tuple(Row(**each) for each in design.rows())
+    rows = tuple(Row(**row) for row in design.rows())
     return table(rows, columns, design=design)
 
 
 def with_rates(first: float, second: float) -> Counts:
     """Twelve equal images: shares of the pixels of both classes that are right, by region."""
     right = [round(1000 * first), round(1000 * second)]
-    image = [[[each, 1000 - each], [1000 - each, each]] for each in right]
+    image = [[[share, 1000 - share], [1000 - share, share]] for share in right]
     return counts_of(*[image] * 12, night=None)
 
 
@@ -76,13 +76,9 @@ def trained(seeds: int = 2) -> dict[tuple[str, int], Any]:
     return runs
 
 
-def effects(table: Table, runs: Any) -> Effects:
-    return effects_of(TableJudge("own/t", table, resamples=100), runs)
-
-
 def estimates(table: Table, runs: Any) -> dict[tuple[str, str, str], Any]:
-    lines = effects(table, runs).frame.itertuples()
-    return {(line.method, line.against, line.effect): line for line in lines}  # type: ignore[misc]
+    frame, _ = effects_of(judged(table, runs))
+    return {(line.method, line.against, line.effect): line for line in frame.itertuples()}  # type: ignore[misc]
 
 
 def test_effects_are_of_contrasts_within_runs() -> None:
@@ -101,9 +97,9 @@ def test_method_with_missing_cell_is_named_others_are_analysed() -> None:
     runs = trained()
     for seed in (0, 1):
         runs["crm N+T-", seed] = failed("no memory")
-    found = effects(design_table(), runs)
-    assert set(found.frame["method"]) == {"baseline"}
-    assert found.missing == ("trained, crm: row 'crm N+T-' has no finished run.",)
+    frame, lacking = effects_of(judged(design_table(), runs))
+    assert set(frame["method"]) == {"baseline"}
+    assert lacking == ["trained, crm: row 'crm N+T-' has no finished run."]
 
 
 def test_seeds_that_not_all_cells_have_are_left_out() -> None:
@@ -132,23 +128,22 @@ def test_claims_about_effects_are_judged() -> None:
     """Noise makes region 1 worse, and with it the difference of the regions."""
     claims = (claim("N", "lower"), claim("N", "higher"), claim("T", "higher"))
     made = replace(design_table(), claims=claims)
-    judge = TableJudge("own/t", made, resamples=100)
-    worse, better, texture = judge.claims(trained(3))  # type: ignore[arg-type]
-    assert [each.word for each in (worse, better)] == ["holds", "contradicted"]
+    found = judged(made, trained(3))
+    worse, better, texture = found.claims
+    assert [worse.word, better.word] == ["holds", "contradicted"]
     assert texture.word != "holds"
     assert worse.verdict is not None
     assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
     assert "N+ - N- (trained)" in worse.contrast
-    unfinished = {run: each for run, each in trained(3).items() if run[0] != "baseline N+T-"}
-    assert judge.claims(unfinished)[0].word == "not run"  # type: ignore[arg-type]
+    others = {run: outcome for run, outcome in found.runs.items() if run[0] != "baseline N+T-"}
+    assert replace(found, runs=others).claims[0].word == "not run"
 
 
 def test_claim_is_about_one_part_of_a_design() -> None:
     claims = tuple(claim("N", "lower", part) for part in ("", "tested", "trained"))
-    judge = TableJudge("own/t", replace(design_table(tested=WHOLE), claims=claims), resamples=100)
-    judged = judge.claims(trained(3))  # type: ignore[arg-type]
-    assert [each.word for each in judged] == ["not run", "not run", "holds"]
-    assert "N+ - N- (trained)" in judged[-1].contrast
+    found = judged(replace(design_table(tested=WHOLE), claims=claims), trained(3)).claims
+    assert [claim.word for claim in found] == ["not run", "not run", "holds"]
+    assert "N+ - N- (trained)" in found[-1].contrast
 
 
 def test_networks_tested_in_worlds_use_counts_of_each() -> None:

@@ -9,12 +9,14 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
-from sweeps.judge.judged_table import CellRunId, JudgedClaim, TableJudge, as_claimed
+from sweeps.judge.contrasts import as_claimed
+from sweeps.judge.judged_table import JudgedClaim
 from sweeps.plan.claim import Claim
+from sweeps.plan.request import RowSeed
 from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
-from sweeps.score.cells import CellId, TableCell, score
-from tests.sweeps.judge.accuracies import accuracy, planted
+from sweeps.score.cells import TableCell
+from tests.sweeps.judge.accuracies import accuracy, judged, planted
 from tests.sweeps.tabled import failed, outcome, table
 
 SHARES = {"low": (50.0, 51.0, 49.0), "high": (60.0, 61.5, 59.0), "same": (60.5, 60.0, 60.5)}
@@ -30,21 +32,17 @@ def claim(name: str = "c", **others: Any) -> Claim:
 
 
 def of(*claims: Claim, rows: tuple[str, ...] = tuple(SHARES), **others: Any) -> Table:
-    made = tuple(
-        Row(label=label, experiment="crm", values={"acc": PRINTED[label]} if printed else {})
-        for label in rows
-        if (printed := label in PRINTED) or True
-    )
-    return table(made, (ACC,), claims=claims, **others)
+    made = []
+    for label in rows:
+        values = {"acc": PRINTED[label]} if label in PRINTED else {}
+        made.append(Row(label=label, experiment="crm", values=values))
+    return table(tuple(made), (ACC,), claims=claims, **others)
 
 
-def judge(one: Claim, runs: dict[CellRunId, Outcome] | None = None, **others: Any) -> JudgedClaim:
+def judge(one: Claim, runs: dict[RowSeed, Outcome] | None = None, **others: Any) -> JudgedClaim:
     runs = planted(SHARES) if runs is None else runs
-    return TableJudge("own/t", of(one, **others), resamples=200).judge(one, runs)
-
-
-def marked(judge: TableJudge, runs: Any) -> dict[CellId, int]:
-    return judge.marks(score("own/t", judge.table, runs, scale="demo"), runs)
+    (found,) = judged(of(one, **others), runs).claims
+    return found
 
 
 def test_true_false_and_undecidable_claims_come_out_so() -> None:
@@ -53,11 +51,10 @@ def test_true_false_and_undecidable_claims_come_out_so() -> None:
         claim("false", rows=("low",), against=("same",)),
         claim("small", rows=("same",), against=("high",)),
     )
-    made = TableJudge("own/t", of(*claims), resamples=200)
-    found = made.claims(planted(SHARES))  # type: ignore[arg-type]
-    assert [each.word for each in found] == ["holds", "contradicted", "undecided"]
-    assert [each.as_printed for each in found] == [False, False, True]
-    true, _, small = (each.verdict for each in found)
+    found = judged(of(*claims), planted(SHARES)).claims
+    assert [claim.word for claim in found] == ["holds", "contradicted", "undecided"]
+    assert [claim.as_printed for claim in found] == [False, False, True]
+    true, _, small = (claim.verdict for claim in found)
     assert true is not None
     assert small is not None
     assert true.estimate == pytest.approx(10.2, abs=1.0)
@@ -94,11 +91,10 @@ def test_most_with_rows_not_run_is_never_contradicted() -> None:
     rows = ("low", "same", "first", "second", "third")
     most = claim(rows=rows, against=("high",), combine="most")
     shares = {"low": (50.0, 51.0, 49.0), "same": (55.0, 56.0, 54.0), "high": (90.0, 91.0, 89.5)}
-    made = TableJudge("own/t", of(most, rows=("high", *rows)), resamples=200)
-    found = made.judge(most, planted(shares))  # type: ignore[arg-type]
+    found = judge(most, planted(shares), rows=("high", *rows))
     assert (found.word, found.missing) == ("undecided", ("first", "second", "third"))
     every = planted({**dict.fromkeys(rows, shares["low"]), "high": shares["high"]})
-    assert made.judge(most, every).word == "contradicted"  # type: ignore[arg-type]
+    assert judge(most, every, rows=("high", *rows)).word == "contradicted"
 
 
 def test_claim_without_runs_is_not_run() -> None:
@@ -119,7 +115,7 @@ def test_one_seed_decides_nothing() -> None:
 
 
 def test_predictions_without_seeds_are_compared_with_every_seed() -> None:
-    runs: dict[CellRunId, Outcome] = {
+    runs: dict[RowSeed, Outcome] = {
         **planted({"high": SHARES["high"]}),
         ("low", FIXED): outcome("file", accuracy(50.0, 7)),
     }
@@ -154,13 +150,13 @@ def test_best_row_is_marked_where_it_is_shown(best: Any, marks: dict[str, int]) 
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "mid", "high"))
     shares = {"low": (50.0, 51.0, 49.0), "mid": (70.0, 71.0, 70.5), "high": (90.0, 91.0, 90.0)}
     made = table(rows, (column,))
-    found = TableJudge("own/t", made, resamples=200)
     given = planted(shares)
-    assert marked(found, given) == {(label, "acc"): rank for label, rank in marks.items()}  # type: ignore[arg-type]
+    found = judged(made, given)
+    assert found.scored.marks == {(label, "acc"): rank for label, rank in marks.items()}
     noisy = planted({**shares, "high": (90.0, 60.0, 70.0), "low": (50.0, 80.0, 70.0)})
-    assert marked(TableJudge("own/t", made, resamples=200), noisy) == {}  # type: ignore[arg-type]
-    single = {run: each for run, each in given.items() if run[1] == 0}
-    assert marked(found, single) == {}  # type: ignore[arg-type]
+    assert judged(made, noisy).scored.marks == {}
+    single = {run: one for run, one in given.items() if run[1] == 0}
+    assert replace(found, runs=single).scored.marks == {}
 
 
 def test_rows_of_the_same_runs_share_a_mark() -> None:
@@ -168,9 +164,9 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     runs |= {("again", seed): run for (label, seed), run in list(runs.items()) if label == "high"}
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "again"))
     one = claim(rows=("high",), against=("again",))
-    made = TableJudge("own/t", table(rows, (ACC,), claims=(one,)), resamples=200)
-    assert marked(made, runs) == {("high", "acc"): 1, ("again", "acc"): 1}  # type: ignore[arg-type]
-    found = made.judge(one, runs)  # type: ignore[arg-type]
+    made = judged(table(rows, (ACC,), claims=(one,)), runs)
+    assert made.scored.marks == {("high", "acc"): 1, ("again", "acc"): 1}
+    (found,) = made.claims
     assert found.word == "not run"
     assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
 
@@ -184,22 +180,20 @@ def test_claims_about_counted_sizes_are_exact() -> None:
         for label, mean in (("small", 3.0), ("large", 5.0))
     }
     more = {**sizes, ("small", "size"): TableCell(6.0, math.nan, 0)}
-    for given, word in ((sizes, "holds"), (more, "contradicted")):
-        made = TableJudge("own/t", table(rows, (size,), claims=(one,)), sizes=given)
-        assert made.judge(one, {}).word == word
-    assert TableJudge("own/t", table(rows, (size,), claims=(one,))).judge(one, {}).word == "not run"
+    made = table(rows, (size,), claims=(one,))
+    for given, word in ((sizes, "holds"), (more, "contradicted"), ({}, "not run")):
+        (found,) = judged(made, {}, given).claims
+        assert found.word == word
 
 
 def test_rows_of_different_lists_or_machines_are_said() -> None:
     runs = planted({"low": SHARES["low"], "high": SHARES["high"]})
-    for (label, seed), each in runs.items():
+    for (label, seed), finished in runs.items():
         lists = "trained on train.txt" if label == "low" else "trained on all.txt"
         machine = "GPU" if label == "high" and seed else "CPU"
-        run = replace(each.results[0], lists=lists, machine=machine)  # type: ignore[type-var]
-        runs[label, seed] = replace(each, results=(run,))
-    basis = judge(claim(rows=("high",), against=("low",)), runs).basis
-    assert basis is not None
-    assert basis.warnings == (
+        run: Any = replace(finished.results[0], lists=lists, machine=machine)  # type: ignore[type-var]
+        runs[label, seed] = replace(finished, results=(run,))
+    assert judge(claim(rows=("high",), against=("low",)), runs).warnings == (
         "Different lists: low trained on train.txt; high trained on all.txt.",
         "Seeds 1, 2 mix machines, which train differently.",
     )
@@ -214,6 +208,6 @@ def test_seeds_without_the_evaluation_do_not_count() -> None:
             made = {(): own, ("modality=rgb",): of_rgb} if seed < 2 else own
             runs[label, seed] = outcome(f"{label}{seed}", made)
     rgb = replace(of(one), columns=(Column(**{**vars(ACC), "modality": "rgb"}),))
-    found = TableJudge("own/t", rgb, resamples=200).judge(one, runs).verdict  # type: ignore[arg-type]
-    assert found is not None
-    assert (found.seeds, round(found.estimate)) == (2, 10)
+    (found,) = judged(rgb, runs).claims
+    assert found.verdict is not None
+    assert (found.verdict.seeds, round(found.verdict.estimate)) == (2, 10)

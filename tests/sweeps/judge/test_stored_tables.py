@@ -9,7 +9,9 @@ import pytest
 
 from analysis.results import finished_runs
 from rgbt.runs.folder import RunFolder, read_description
-from sweeps.judge.stored_tables import FinishedRuns, TableResults, Variant
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.judge.reader import RunReader
+from sweeps.judge.stored_tables import judged_tables
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import REQUESTED
 from sweeps.plan.table import Table, load_table
@@ -28,25 +30,22 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
-def results(runs: Path, table: Table | None = None) -> TableResults:
-    finished = FinishedRuns(finished_runs(runs, runs / "none"))
-    planner = Planner((f"runs_dir={runs}",))
-    return TableResults(finished, planner, {NAME: table or load_table(NAME)}, 100)
+def judge(runs: Path, table: Table | None = None) -> tuple[list[JudgedTable], list[str]]:
+    """The tables with runs, and the remarks."""
+    reader, remarks = RunReader(finished_runs(runs, runs / "none")), list[str]()
+    tables, planner = {NAME: table or load_table(NAME)}, Planner((f"runs_dir={runs}",))
+    return list(judged_tables(reader, planner, tables, remarks, resamples=100)), remarks
 
 
 def test_runs_are_apart_by_the_words_that_were_typed(runs: Path) -> None:
-    found = results(runs)
-    assert {variant for _, variant in found.requested} == {
-        Variant("bench"),
-        Variant("bench", "paper", WORDS),
-    }
-    plain, other = list(found)
-    assert (plain.words, other.words) == ((), WORDS)
+    (plain, other), remarks = judge(runs)
+    assert (plain.request.extra, other.request.extra) == ((), WORDS)
+    assert (plain.request.scale, other.request.scale) == ("bench", "bench")
     assert plain.runs.keys() == other.runs.keys()
     assert len(other.runs) == 2
-    keys = {run.results[0].key for result in (plain, other) for run in result.runs.values()}
+    keys = {run.results[0].key for table in (plain, other) for run in table.runs.values()}
     assert len(keys) == 4
-    assert found.remarks == []
+    assert remarks == []
 
 
 def test_a_row_that_is_another_one_today_has_no_run(runs: Path) -> None:
@@ -54,8 +53,8 @@ def test_a_row_that_is_another_one_today_has_no_run(runs: Path) -> None:
     first = table.runnable_rows[0]
     changed = replace(first, overrides=(*first.overrides, "optimizer.lr=0.5"))
     rows = tuple(changed if row is first else row for row in table.rows)
-    for result in results(runs, replace(table, rows=rows)):
-        assert {label for label, _ in result.runs} == {table.runnable_rows[1].label}
+    for judged in judge(runs, replace(table, rows=rows))[0]:
+        assert {label for label, _ in judged.runs} == {table.runnable_rows[1].label}
 
 
 @pytest.mark.parametrize("text", ["paper", "paper x hydra.run.dir=/a", "other x", "paper 'x"])
@@ -65,7 +64,6 @@ def test_a_tag_that_no_request_has_is_a_remark(runs: Path, text: str) -> None:
     assert known is not None
     tags = {**known.tags, REQUESTED + NAME: text}
     RunFolder(path.parent).describe(replace(known, tags=tags))
-    found = results(runs)
-    assert sorted(len(result.runs) for result in found) == [1, 2]
-    (remark,) = found.remarks
+    tables, (remark,) = judge(runs)
+    assert sorted(len(table.runs) for table in tables) == [1, 2]
     assert f"Run {path.parent.name} belongs to no table" in remark

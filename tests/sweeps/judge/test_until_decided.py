@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.uncertainty.verdicts import AnyTime
-from sweeps.judge.judged_table import TableJudge
+from sweeps.judge.judged_table import JudgedTable
 from sweeps.judge.until_decided import START, SeedsUntilDecided
 from sweeps.plan.claim import Claim
 from sweeps.plan.request import TableRequest, seed_of
@@ -42,9 +41,7 @@ def adding(*claims: Claim, max_seeds: int = MAX) -> SeedsUntilDecided:
     request = TableRequest(
         "own/t", table(rows, claims=claims), "demo", tuple(range(START)), until_decided=True
     )
-    quick = 200
-    judge = TableJudge("own/t", request.table, AnyTime(), quick)
-    return SeedsUntilDecided(request, judge, max_seeds)
+    return SeedsUntilDecided(JudgedTable(request=request, resamples=200), max_seeds)
 
 
 def row_of(point: Point) -> str:
@@ -73,7 +70,7 @@ def complete(
     finish: Callable[[Sequence[Point]], list[Outcome]] = finished,
 ) -> list[Outcome]:
     """All outcomes, with every added point run."""
-    outcomes = list(before) or finish(until.request.points())
+    outcomes = list(before) or finish(until.judged.request.points())
     while further := until(outcomes):
         outcomes += finish(further)
     return outcomes
@@ -88,32 +85,28 @@ def test_rows_of_undecided_claims_get_seeds_up_to_maximum() -> None:
     until = adding(TRUE, OPEN)
     outcomes = complete(until)
     assert seeds(outcomes) == {"ours": DECIDED, "base": MAX, "twin": MAX, "other": START}
-    (judged,) = (
-        each
-        for each in until.judge.claims(until.request.runs(outcomes))
-        if each.claim.name == "open"
-    )
-    assert (judged.word, judged.verdict and judged.verdict.seeds) == ("undecided", MAX)
+    _, found = replace(until.judged, runs=until.judged.request.runs(outcomes)).claims
+    assert (found.word, found.verdict and found.verdict.seeds) == ("undecided", MAX)
 
 
 def test_added_points_have_one_seed_and_name_the_rule() -> None:
     until = adding(OPEN)
-    further = until(finished(until.request.points()))
-    assert [(row_of(each), seed_of(each.overrides)) for each in further] == [
+    further = until(finished(until.judged.request.points()))
+    assert [(row_of(point), seed_of(point.overrides)) for point in further] == [
         ("base", START),
         ("twin", START),
     ]
-    assert all("rgbt.until_decided/own/t" in each.tags for each in further)
+    assert all("rgbt.until_decided/own/t" in point.tags for point in further)
 
 
 def test_at_most_two_seeds_of_a_claim_are_unfinished() -> None:
     until = adding(OPEN)
-    outcomes = finished(until.request.points())
+    outcomes = finished(until.judged.request.points())
     further = until(outcomes)
     first, second = finished(further)
     outcomes += [first, Outcome(second.point, "running")]
     ahead = until(outcomes)
-    assert {seed_of(each.overrides) for each in ahead} == {START + 1}, "a slot is not left idle"
+    assert {seed_of(point.overrides) for point in ahead} == {START + 1}, "a slot is not left idle"
     one, other = finished(ahead)
     outcomes += [one, Outcome(other.point, "running")]
     assert until(outcomes) == [], "two seeds of the claim are unfinished"
@@ -121,11 +114,9 @@ def test_at_most_two_seeds_of_a_claim_are_unfinished() -> None:
 
 def test_claim_with_a_failed_row_is_not_extended() -> None:
     def failing(points: Sequence[Point]) -> list[Outcome]:
-        made = finished(points)
-        return [
-            Outcome(each.point, "failed", "no memory") if row_of(each.point) == "twin" else each
-            for each in made
-        ]
+        twins = [point for point in points if row_of(point) == "twin"]
+        others = [point for point in points if point not in twins]
+        return [*finished(others), *(Outcome(point, "failed", "no memory") for point in twins)]
 
     assert seeds(complete(adding(OPEN), finish=failing)) == dict.fromkeys(MEANS, START)
 

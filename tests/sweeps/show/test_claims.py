@@ -8,11 +8,10 @@ import pytest
 from rich.console import Console
 
 from rgbt.terminal import rich_table
-from sweeps.judge.judged_table import TableJudge
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Row
 from sweeps.show.claims import WORDS, claim_grids, claims_frame
-from tests.sweeps.judge.accuracies import planted
+from tests.sweeps.judge.accuracies import judged, planted
 from tests.sweeps.tabled import table
 
 SAYS = "The network with both images is better than the one with the visible images alone."
@@ -28,8 +27,8 @@ def test_no_verdict_is_cut(width: int) -> None:
         for name, (row, other) in pairs.items()
     )
     rows = tuple(Row(label=label, experiment="crm") for label in shares)
-    judge = TableJudge("a_paper/a_table", table(rows, claims=claims), resamples=100)
-    frame = claims_frame(judge.claims(planted(shares)))  # type: ignore[arg-type]
+    made = judged(table(rows, claims=claims), planted(shares), name="a_paper/a_table")
+    frame = claims_frame(made.claims)
     console = Console(file=io.StringIO(), width=width)
     for grid in claim_grids(frame, noted=True):
         console.print(rich_table(grid))

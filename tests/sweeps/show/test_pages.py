@@ -21,7 +21,7 @@ from analysis.archive import _compared, add
 from rgbt.checks import InputError
 from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.result import RunResult
-from sweeps.report import entry, report_of
+from sweeps.report import entry
 from sweeps.show.pages import Report
 from tests.commands import Call
 from tests.models.external.standins import STACKED, write_checkout
@@ -77,7 +77,7 @@ def inside(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def made(runs: Path = Path("runs"), archive: Path = Path("none")) -> Report:
-    return report_of(runs, archive, 200, counted=False)
+    return Report(runs, archive, 200, counted=False)
 
 
 @pytest.fixture(scope="module")
@@ -144,10 +144,10 @@ def test_rows_of_a_missing_checkout_are_found_by_settings(
 
 def test_runs_of_one_start_are_apart_with_a_warning(report: Report) -> None:
     text = report.page("spatialseg")
-    each = section(text, "## TABLE III (scale=bench)")
+    own = section(text, "## TABLE III (scale=bench)")
     one = section(text, "## TABLE III (scale=bench, seeds.start=common)")
-    assert "a start for each seed, 3 seeds" in each
-    assert "began from one start" not in each
+    assert "a start for each seed, 3 seeds" in own
+    assert "began from one start" not in own
     assert "one start for all seeds, seeds.start=common, 3 seeds" in one
     assert one.count("All seeds began from one start") == one.count("(synthetic images")
     assert "Every row of ours was run with seeds.start=common." in one
@@ -215,7 +215,7 @@ def test_html_loads_nothing_and_runs_its_own_script(html: str) -> None:
     found.feed(html)
     assert found.tags.count("script") == 1
     assert found.addresses
-    assert all(each.startswith("data:image/svg+xml;base64,") for each in found.addresses)
+    assert all(address.startswith("data:image/svg+xml;base64,") for address in found.addresses)
     script = re.search(r"<script>(.*)</script>", html, re.DOTALL)
     assert script is not None
     digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
@@ -265,7 +265,7 @@ def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) 
 def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -> None:
     shutil.copytree(place / "runs", tmp_path / "runs")
     files = sorted((tmp_path / "runs").glob("*/run.json"))
-    file = next(each for each in files if "my/planted" in each.read_text())
+    file = next(file for file in files if "my/planted" in file.read_text())
     edit(file, "rgbt.group", "<script>alert(1)</script> /home/me/secret/data | x")
     found = made(tmp_path / "runs")
     page = found.html()
@@ -337,7 +337,7 @@ def test_empty_archive_says_so_with_the_command(tmp_path: Path) -> None:
 def test_command_writes_pages_fills_marks_and_removes_old_figures(
     call: Call, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sweeps.show.pages.million_parameters", lambda words: 1.0)
+    monkeypatch.setattr("sweeps.show.sections.million_parameters", lambda words: 1.0)
     out, page = tmp_path / "out", tmp_path / "README.md"
     out.mkdir()
     (out / "stale.svg").touch()

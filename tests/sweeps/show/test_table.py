@@ -13,10 +13,8 @@ from sweeps.plan.table import Column, Row
 from sweeps.score.cells import ScoredTable, TableCell, score, size_marks
 from sweeps.show.table import (
     COUNTED,
-    MARKDOWN,
     NOT_PRINTED,
     SMALL,
-    TERMINAL,
     latex,
     render_table,
     tidy_csv,
@@ -35,7 +33,7 @@ def wide(**others: Any) -> ScoredTable:
 
 
 def grid(scored: ScoredTable, **others: Any) -> TextTable:
-    return render_table(scored, TERMINAL, **others)
+    return render_table(scored, "terminal", **others)
 
 
 def test_lines_are_ours_published_and_difference() -> None:
@@ -49,7 +47,7 @@ def test_lines_are_ours_published_and_difference() -> None:
         *(("", "published", "", "47.5"), ("", "difference", "", "+22.50")),
         ("theirs", "published", "", "50.0"),
     )
-    assert "**70.00 ± 10.00**" in render_table(Made(ROWS).scored(MARKS), MARKDOWN).to_markdown()
+    assert "**70.00 ± 10.00**" in render_table(Made(ROWS).scored(MARKS), "markdown").to_markdown()
 
 
 def test_paper_scale_is_not_called_small() -> None:
