@@ -16,7 +16,7 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.verdicts.judge import JudgedClaim
+    from sweeps.judge.judged_table import JudgedClaim
 
 ALL = "all"
 
@@ -45,7 +45,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import path_lines, print_rich, rich_table
-    from sweeps.rendering.claims import (
+    from sweeps.show.claims import (
         claim_grids,
         claims_frame,
         claims_markdown,
@@ -70,41 +70,50 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
-    """The claims of the requested tables, judged by the finished runs."""
+    """Judge the claims of the requested tables by the finished runs."""
     from rich.console import Console
     from rich.progress import track
 
     from analysis.results import finished_runs
-    from sweeps.run.planner import Planner
-    from sweeps.table.request import TableRequest
-    from sweeps.table.table import is_own, table_names
-    from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
-    from sweeps.verdicts.stored import FinishedRuns, TableResults
+    from sweeps.judge.judged_table import JudgedTable
+    from sweeps.judge.reader import RunReader
+    from sweeps.judge.stored_tables import runs_of_request
+    from sweeps.plan.planner import Planner
+    from sweeps.plan.request import (
+        TableRequest,
+        check_equal_runs,
+        check_override,
+        make_request,
+        read_named,
+    )
+    from sweeps.plan.table import is_own, table_names
+    from sweeps.score.efficiency import network_sizes
 
     names = table_names(Path("none"))
     if options.table != ALL:
         names = split_list(options.table, "tables")
-    finished = FinishedRuns(finished_runs(options.runs_dir, options.archive))
+    reader = RunReader(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
-    source = TableResults(finished, planner, counted=True)
     judged: list[JudgedClaim] = []
-    for each in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(each)
+    for typed in track(names, "judging", console=Console(stderr=True), transient=True):
+        name, table = read_named(typed)
         if not table.claims:
             continue
-        request, external = make_request(
+        request = make_request(
             TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
         )
-        if external:
+        for row in request.external:
             raise InputError(
-                f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
+                f"{row.kind}.{row.label}: only finished runs are judged here; "
                 f"use rgbt reproduce table={name} for rows that are not trained."
             )
-        if overrides or is_own(each):  # a test checks the others
+        if overrides or is_own(typed):  # a test checks the others
             check_equal_runs(request, planner)
-        judged += source.result(request, checked=bool(overrides)).claims
+        runs = runs_of_request(request, reader, planner, checked=bool(overrides))
+        sizes = network_sizes(request)
+        judged += JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader).claims
     return judged
 
 

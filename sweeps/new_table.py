@@ -34,7 +34,7 @@ def new(options: NewOptions, overrides: list[str]) -> int:
 
     Overrides with comma lists are the varied keys: masker.sigma_div=1,2,4 masker.patch_size=32,64
     """
-    from sweeps.table.table import OWN, load_table
+    from sweeps.plan.table import OWN, load_table
 
     path = write_new(options.table, options.experiment, overrides, OWN)
     sys.stdout.write(
@@ -54,10 +54,10 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     from rgbt.config.command import composing
     from rgbt.config.compose import PIXELS
     from rgbt.files.atomic import write_atomic
+    from sweeps.plan.planner import specify_run
+    from sweeps.plan.table import PUBLISHED
     from sweeps.point import short_names
-    from sweeps.run.planner import specify_run
     from sweeps.space import grid_points, split
-    from sweeps.table.table import PUBLISHED
 
     path = folder / f"{name}.yaml"
     if path.exists() or (PUBLISHED / f"{name}.yaml").exists():

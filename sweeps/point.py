@@ -6,21 +6,22 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Literal
 
 from rgbt.runs.folder import read_result
 from rgbt.runs.result import RunResult
-from sweeps.evaluation import Words
+from sweeps.plan.measurement import Words
 
 Value = str | int | float | bool | None
-State = Literal["finished", "failed", "running", "waiting", "missing"]
+State = Literal["finished", "failed", "pruned", "running", "waiting"]
 # States of points that a command runs.
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 
 
 @dataclass(frozen=True)
 class Point:
-    """One cell of a table, point of a grid or trial of a search.
+    """Describes one cell of a table, point of a grid or trial of a search.
 
     Attributes:
         label: as shown, e.g. "Ny/4 seed=1".
@@ -39,33 +40,43 @@ class Point:
     evaluations: tuple[Words, ...] = ()
 
     def runs(self) -> tuple[tuple[str, ...], ...]:
-        """Overrides of each run."""
-        return tuple((*self.overrides, f"seed={seed}") for seed in self.seeds) or (self.overrides,)
+        """Return the overrides of each run."""
+        if not self.seeds:
+            return (self.overrides,)
+        return tuple((*self.overrides, f"seed={seed}") for seed in self.seeds)
 
 
-def short_names(names: Collection[str]) -> dict[str, str]:
-    """Keys cut to their last part where that is unique: "masker.sigma_div" -> "sigma_div"."""
-    ends = Counter(name.rpartition(".")[2] for name in names)
-    return {name: end if ends[end := name.rpartition(".")[2]] == 1 else name for name in names}
+def short_names(keys: Collection[str]) -> dict[str, str]:
+    """Cut keys to their last part where that is unique: "masker.sigma_div" -> "sigma_div"."""
+    ends = {key: key.rpartition(".")[2] for key in keys}
+    counts = Counter(ends.values())
+    return {key: end if counts[end] == 1 else key for key, end in ends.items()}
 
 
 def varied_keys(points: Sequence[Point]) -> list[str]:
-    """Keys of the overrides that not all points have, in order."""
-    common = set.intersection(*(set(point.overrides) for point in points)) if points else set()
-    words = (word for point in points for word in point.overrides if word not in common)
-    return list(dict.fromkeys(word.lstrip("+").partition("=")[0] for word in words))
+    """Return the keys of the overrides that not all points have, in order."""
+    if not points:
+        return []
+    common = set(points[0].overrides).intersection(*(point.overrides for point in points))
+    keys = dict[str, None]()
+    for point in points:
+        for word in point.overrides:
+            if word not in common:
+                keys[word.lstrip("+").partition("=")[0]] = None
+    return list(keys)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A point with its state and its finished runs.
+    """Says how a point stands, with its finished runs.
 
     Attributes:
-        state: "running" is by another driver, "missing" not in the store that is read.
-        reason: why it failed, or "".
+        state: "running" may be by another driver; "pruned" is only a trial of a search.
+        reason: why it failed or was pruned, in a sentence, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
         missing: words of a measurement that a finished run has not -> why.
+        job_s: seconds that its job has run, as far as this driver saw it.
     """
 
     point: Point
@@ -74,6 +85,7 @@ class Outcome:
     results: tuple[RunResult, ...] = ()
     keys: tuple[str, ...] = ()
     missing: Mapping[Words, str] = field(default_factory=dict)
+    job_s: float = 0.0
 
     @property
     def is_trained(self) -> bool:
@@ -83,6 +95,14 @@ class Outcome:
     @property
     def seconds(self) -> float | None:
         """Duration of its runs; None where one of them is unknown."""
-        found = [read_result(result.folder) or {} for result in self.results]
-        total = sum(each.get("seconds_of_last_process", math.nan) for each in found)
-        return total if found and math.isfinite(total) else None
+        total = 0.0
+        for result in self.results:
+            known = read_result(result.folder) or {}
+            total += known.get("seconds_of_last_process", math.nan)
+        return total if self.results and math.isfinite(total) else None
+
+    def scores(self) -> dict[str, float]:
+        """Return the scores that all its runs have, averaged over the runs, in percent."""
+        first, *others = [result.recorded_scores() for result in self.results]
+        shared = [name for name in first if all(name in scores for scores in others)]
+        return {name: fmean([first[name], *(run[name] for run in others)]) for name in shared}

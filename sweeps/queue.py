@@ -9,28 +9,23 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
 
 from analysis.archive import add
-from rgbt.checks import InputError, split_list
+from rgbt.checks import InputError
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
 from rgbt.terminal import info, print_rich, rich_table
+from sweeps.judge.contrasts import contrasts_of
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.judge.until_decided import SeedsUntilDecided
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import TAG, TableRequest, seed_of
 from sweeps.point import Outcome, Point
-from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
 from sweeps.run.run_store import RunStore
 from sweeps.settings import SweepSettings
 from sweeps.space import signature
-from sweeps.table.request import TAG, seed_of
-from sweeps.table.table import study_names, table_names
-from sweeps.table_plan import TablePlan, plan_table
-from sweeps.verdicts.judge import contrasts_of
-
-if TYPE_CHECKING:
-    from sweeps.reproduce import Options
 
 # Estimated duration of a run as long as no run of its network has finished: that of an arm at
 # bench scale on two cores.
@@ -46,9 +41,10 @@ class Queue:
     seed is another training there. `claims` and `decided` count claims about scores, see `more`.
     """
 
-    plans: Sequence[TablePlan]
+    requests: Sequence[TableRequest]
     runs: RunStore
     planner: Planner
+    max_seeds: int
     is_dry: bool = False
     claims: int = 0
     decided: int = 0
@@ -59,79 +55,108 @@ class Queue:
     _seen: set[int] = field(default_factory=set)  # places of finished points
 
     def __post_init__(self) -> None:
-        self.points = tuple(point for plan in self.plans for point in plan.points.points)
-        self.owners = [n for n, plan in enumerate(self.plans) for _ in plan.points.points]
+        self._tables: list[SeedsUntilDecided] = []
+        self._owners: list[int] = []  # of every point, the place of its table
+        points: list[Point] = []
+        for place, request in enumerate(self.requests):
+            # Nothing is counted of the networks themselves.
+            judged = JudgedTable(request=request)
+            self._tables.append(SeedsUntilDecided(judged, self.max_seeds))
+            of_table = request.points()
+            points += of_table
+            self._owners += [place] * len(of_table)
+        self.points = tuple(points)
 
     def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
-        """The next seeds of open claims, given all points in their order.
+        """Return the next seeds of open claims, given all points in their order.
 
         It adds new finished runs to the archive, unless it `is_dry`.
         """
-        finished = {n for n, outcome in enumerate(outcomes) if outcome.state == "finished"}
-        for outcome in (outcomes[place] for place in finished - self._seen):
-            for result in filter(self.runs.is_own, outcome.results):
-                if self.runs.archive is not None and not self.is_dry:
-                    add(result, self.runs.archive)
-            if outcome.seconds is not None:
-                self._seconds[self._network(outcome.point)].append(outcome.seconds)
-        self._seen = finished
-        added, owners = list[Point](), list(self.owners)
+        self._note_finished(outcomes)
+        added: list[Point] = []
+        owners = list(self._owners)
         self.claims = self.decided = 0
         self._worth.clear()
-        for place, plan in enumerate(self.plans):
-            own = [each for each, owner in zip(outcomes, owners, strict=True) if owner == place]
-            new = plan.until_decided(own) if plan.until_decided else []
-            self._count(plan, own, [*(o.point for o in own if o.state == "waiting"), *new])
+        for place, table in enumerate(self._tables):
+            pairs = zip(outcomes, owners, strict=True)
+            own = [outcome for outcome, owner in pairs if owner == place]
+            new = table(own) if table.judged.request.until_decided else []
+            waiting = [outcome.point for outcome in own if outcome.state == "waiting"]
+            self._count(table, own, [*waiting, *new])
             added += new
-            self.owners += [place] * len(new)
+            self._owners += [place] * len(new)
         return added
 
-    def _count(self, plan: TablePlan, outcomes: Sequence[Outcome], missing: list[Point]) -> None:
+    def _note_finished(self, outcomes: Sequence[Outcome]) -> None:
+        """Archive the runs of newly finished points, and note how long they took."""
+        archive = None if self.is_dry else self.runs.archive
+        seen, self._seen = self._seen, set()
+        for place, outcome in enumerate(outcomes):
+            if outcome.state != "finished":
+                continue
+            self._seen.add(place)
+            if place in seen:
+                continue
+            for result in outcome.results:
+                if archive is not None and self.runs.is_own(result):
+                    add(result, archive)
+            if outcome.seconds is not None:
+                self._seconds[self._network(outcome.point)].append(outcome.seconds)
+
+    def _count(
+        self, seeds: SeedsUntilDecided, outcomes: Sequence[Outcome], missing: list[Point]
+    ) -> None:
         """Add what the missing runs of a table are worth; claims on a design need all its rows."""
-        request, table = plan.request, plan.request.table
-        judged = {each.claim.name: each.word for each in plan.judge.claims(request.runs(outcomes))}
-        elsewhere = {
-            seed_of(each.point.overrides)
-            for each in outcomes
-            if any(run.machine not in ("", self.machine) for run in each.results)
-        }
-        rows = {
-            point.overrides: set(point.tags[TAG + request.name].split(" | "))
-            for point in missing
-            if seed_of(point.overrides) not in elsewhere
-        }
+        request = seeds.judged.request
+        table = request.table
+        claims = replace(seeds.judged, runs=request.runs(outcomes)).claims
+        words_of = {judged.claim.name: judged.word for judged in claims}
+        elsewhere = set()
+        for outcome in outcomes:
+            if any(run.machine not in ("", self.machine) for run in outcome.results):
+                elsewhere.add(seed_of(outcome.point.overrides))
+        rows: dict[tuple[str, ...], set[str]] = {}  # labels by the overrides of their run
+        for point in missing:
+            if seed_of(point.overrides) not in elsewhere:
+                rows[point.overrides] = set(point.tags[TAG + request.name].split(" | "))
         sizes = {column.name for column in table.columns if column.efficiency is not None}
-        for claim in (each for each in table.claims if not sizes & set(each.columns)):
-            named = {cell.row for each in contrasts_of(claim, table) for cell in each.cells}
-            needed = [each for each, labels in rows.items() if labels & named or not named]
-            is_open = judged.get(claim.name) not in ("holds", "contradicted")
+        for claim in table.claims:
+            if sizes & set(claim.columns):
+                continue
+            named: set[str] = set()
+            for contrast in contrasts_of(claim, table):
+                named |= contrast.rows
+            needed = [words for words, labels in rows.items() if labels & named or not named]
+            is_open = words_of.get(claim.name) not in ("holds", "contradicted")
             self.claims += 1
             self.decided += not is_open
-            for overrides in needed if is_open else ():
-                self._worth[overrides] += 1 / len(needed)
+            if is_open:
+                for words in needed:
+                    self._worth[words] += 1 / len(needed)
 
     def rank(self, point: Point) -> float:
-        """Claims a second that a missing run decides, as far as that is known."""
+        """Return the claims a second that a missing run decides, as far as that is known."""
         return self._worth[point.overrides] / self.seconds(point)
 
     def seconds(self, point: Point) -> float:
-        """Estimated duration of a run."""
+        """Estimate the duration of a run."""
         return median(self._seconds.get(self._network(point)) or [DEFAULT_S])
 
     def _network(self, point: Point) -> str:
-        """The class of the network of a run."""
+        """Return the class of the network of a run."""
         return str(self.planner.specify((*self.planner.base, *point.overrides)).model.target)
 
     def preview(self, outcomes: Sequence[Outcome]) -> TextTable:
-        """The missing runs in the order in which they would be run today, each once."""
+        """Show the missing runs in the order in which they would be run today, each once."""
         tables: dict[tuple[str, ...], list[str]] = defaultdict(list)
         missing: dict[tuple[str, ...], Point] = {}
-        for outcome, owner in zip(outcomes, self.owners, strict=False):
+        for outcome, owner in zip(outcomes, self._owners, strict=False):
             if outcome.state == "waiting":
                 point = outcome.point
                 missing.setdefault(point.overrides, point)
-                tables[point.overrides].append(self.plans[owner].request.name)
-        rows, total = list[tuple[str, ...]](), 0.0
+                tables[point.overrides].append(self.requests[owner].name)
+        rows: list[tuple[str, ...]] = []
+        total = 0.0
         for point in sorted(missing.values(), key=self.rank, reverse=True):
             minutes, worth = self.seconds(point) / 60, self._worth[point.overrides]
             total += minutes
@@ -142,54 +167,46 @@ class Queue:
 
 
 def run_queue(
-    options: Options,
-    overrides: Sequence[str],
+    requests: Sequence[TableRequest],
     settings: SweepSettings,
     runs: RunStore,
     planner: Planner,
+    max_seeds: int,
 ) -> int:
-    """Run what several tables lack until the time is over; 1 if a run failed.
-
-    A table that cannot be trained with these options is left out with a line.
-    """
-    every = [*table_names(Path("none")), *study_names()]
-    names = every if options.table == "all" else split_list(options.table, "tables")
-    plans, runs.archive = list[TablePlan](), options.archive
-    for name in names:
-        try:
-            # Nothing is counted of the networks themselves.
-            plan = plan_table(replace(options, table=name, dry_run=True), overrides, runs, planner)
-            _check(plan, planner)
-            plans.append(plan)
-        except InputError as error:
-            info(f"{name} is left out: {error}")
-    if not plans:
-        raise InputError(f"table={options.table}: none of them can be trained.")
-    queue, title = Queue(plans, runs, planner, options.dry_run), f"tables {options.scale}"
-    identity = signature([plan.points.study for plan in plans])
-    study = f"{title} {identity[:6]}"  # a driver of other tables does not run these
-    points = PointList(study, title, queue.points, runs, planner, more=queue.more, rank=queue.rank)
+    """Run what several tables lack until the time is over; 1 if a run failed."""
+    queue = Queue(requests, runs, planner, max_seeds, is_dry=settings.dry_run)
+    scale = requests[0].scale
+    identity = signature([request.study for request in requests])
+    points = PointList(
+        f"tables {scale} {identity[:6]}",  # a driver of other tables does not run these
+        f"tables {scale}",
+        queue.points,
+        runs,
+        planner,
+        more=queue.more,
+        rank=queue.rank,
+    )
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0
-    outcomes = (preview_points if options.dry_run else run_points)(points, settings)
+    outcomes = (preview_points if settings.dry_run else run_points)(points, settings)
     if outcomes is None:
         return 0
     queue.more(outcomes)
-    if options.dry_run:
+    if settings.dry_run:
         print_rich(rich_table(queue.preview(outcomes)))
     states = Counter(outcome.state for outcome in outcomes)
     info(
         f"{states['finished']} of {len(outcomes)} runs are finished, {states['failed']} failed; "
-        f"{queue.decided} of {queue.claims} claims are decided: rgbt claims scale={options.scale}"
+        f"{queue.decided} of {queue.claims} claims are decided: rgbt claims scale={scale}"
     )
     return int(states["failed"] > 0)
 
 
-def _check(plan: TablePlan, planner: Planner) -> None:
-    """InputError: no row of a table can be trained, and why."""
+def check_trainable(request: TableRequest, planner: Planner) -> None:
+    """Refuse a table of which no row can be trained, with the reason of the first row."""
     reasons = []
-    for point in plan.points.points:
+    for point in request.points():
         try:
             planner.plan(point)
         except InputError as error:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
+from rgbt.config.command import LAUNCHERS
 from rgbt.config.values import check_value
 from rgbt.metrics import names as scores
 from rgbt.metrics.scores import MEANS
@@ -16,13 +18,18 @@ from rgbt.ranges import Names, Positive, Text
 
 # Scores that a run measures once, of its best checkpoint.
 FINAL_METRICS = [
-    scores.consistency(s, p) for s in (scores.TC, scores.CA) for p in ("aligned", "released")
+    scores.consistency(score, protocol)
+    for score in (scores.TC, scores.CA)
+    for protocol in ("aligned", "released")
 ]
+
+# Launchers that a sweep works with.
+WORKING = ("basic", "submitit_local", "submitit_slurm", "ray")
 
 
 @dataclass(frozen=True)
 class Objective:
-    """One number that a search optimizes.
+    """Names one number that a search optimizes.
 
     `metric` is "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
     being those of `rgbt.metrics.names`; of two frames "val/TC/aligned" etc.
@@ -39,8 +46,10 @@ class Objective:
         known = [*MEANS, scores.VAR, *FINAL_METRICS]
         is_known = {whole, score} & {*known} or score.startswith(("region/", "class/"))
         if split not in ("val", "test") or not is_known:
-            told = f"val/<score> or test/<score>; {nearest(score, known)}, region/<n>, class/<name>"
-            raise InputError(f"objective '{self.metric}': {told}.")
+            raise InputError(
+                f"objective '{self.metric}': val/<score> or test/<score>; "
+                f"{nearest(score, known)}, region/<n>, class/<name>."
+            )
 
     @property
     def is_consistency(self) -> bool:
@@ -61,16 +70,12 @@ GpuSlot = Gpu | Annotated[tuple[Gpu, ...], Len(1, 64)]
 NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
 
-class Launcher(NamedTuple):
-    """The choice of ``hydra/launcher``, and its settings (``hydra.launcher``)."""
-
-    name: Text = "basic"
-    options: dict[str, Any] = {}
-
-
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings:
-    """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
+    """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults.
+
+    `launcher` is the choice of ``hydra/launcher``, and `launcher_options` are its settings.
+    """
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
@@ -94,34 +99,43 @@ class SweepSettings:
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
     trust: Annotated[str, Len(0, 4096)]
-    launcher: Launcher = Launcher()
+    launcher: Text = "basic"
+    launcher_options: dict[str, Any] = field(default_factory=dict)
 
 
 # Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for.
 UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}
 
 
-def read_settings(node: DictConfig, launcher: Launcher) -> SweepSettings:
-    """Settings from the node ``hydra.sweeper``; InputError names a wrong or missing key."""
-    raw = OmegaConf.to_container(node, resolve=False)
-    assert isinstance(raw, dict), "the node of a sweeper is a mapping"
+def read_settings(node: DictConfig) -> SweepSettings:
+    """Return the settings of the sweeper and of the launcher from the node ``hydra``.
+
+    InputError: a setting is wrong or missing, or the launcher does not work with a sweep or lacks
+    a package.
+    """
+    name = node.runtime.choices["hydra/launcher"]
+    if name not in WORKING:
+        hint = f" ({LAUNCHERS[name]})" if name in LAUNCHERS else ""
+        raise InputError(f"hydra/launcher={name}: a sweep works with {', '.join(WORKING)}{hint}.")
+    if name == "ray" and find_spec("ray") is None:
+        raise InputError("hydra/launcher=ray: it needs pip install 'rgbt[ray]'.")
+    options = OmegaConf.to_container(node.launcher, resolve=True)
+    assert isinstance(options, dict), "the node of a launcher is a mapping"
+    options.pop("_target_", None)
     plain: dict[str, Any] = {}
-    for key in (str(key) for key in raw if key not in ("_target_", "_recursive_")):
-        value = raw[key] or UNRESOLVED[key] if key in UNRESOLVED else node[key]
-        is_config = OmegaConf.is_config(value)
-        plain[key] = OmegaConf.to_container(value, resolve=True) if is_config else value
+    unresolved = OmegaConf.to_container(node.sweeper, resolve=False)
+    assert isinstance(unresolved, dict), "the node of a sweeper is a mapping"
+    for key in (str(key) for key in unresolved if key not in ("_target_", "_recursive_")):
+        value = node.sweeper[key]
+        if key in UNRESOLVED:
+            value = unresolved[key] or UNRESOLVED[key]
+        elif OmegaConf.is_config(value):
+            value = OmegaConf.to_container(value, resolve=True)
+        plain[key] = value
     settings = cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))
-    if not settings.wait and launcher.name in ("basic", "submitit_local"):
-        raise InputError("hydra.sweeper.wait=false: runs of this machine end with the command.")
     if not settings.wait and settings.timeout_minutes is not None:
         raise InputError(
             "hydra.sweeper.timeout_minutes needs hydra.sweeper.wait=true: the command stops the "
             "jobs. SLURM has a limit of its own, hydra.launcher.timeout_min."
         )
-    return replace(settings, launcher=launcher)
-
-
-def read_launcher(node: DictConfig) -> Launcher:
-    """The launcher from the node ``hydra``."""
-    options = OmegaConf.to_container(node.launcher, resolve=True)
-    return Launcher(node.runtime.choices["hydra/launcher"], cast("dict[str, Any]", options))
+    return replace(settings, launcher=name, launcher_options=options)

@@ -11,8 +11,7 @@ Samplers and pruners are nodes such as ``{_target_: optuna.samplers.TPESampler, 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -35,7 +34,7 @@ Space = Mapping[str, Distribution]
 
 
 def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
-    """The distributions of a space, in the order of the file.
+    """Return the distributions of a space, in the order of the file.
 
     `entries`: key -> type (float, int, categorical) and arguments of the distribution. An
     interpolation (``${px:64}``), which the run resolves, and a list among the choices are text.
@@ -47,22 +46,27 @@ def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
         kind = str(options.pop("type", None))
         check_choice(f"{path}.type", kind, ("float", "int", "categorical"))
         if "choices" in options:
-            choices = check_value(f"{path}.choices", options["choices"], list[Any])
-            choices = [_text(one) if isinstance(one, list) else one for one in choices]
-            # Optuna compares by ==, for which 1, 1.0 and true are equal: it would run another one.
-            twice = [one for place, one in enumerate(choices) if one in choices[:place]]
-            if twice:
-                raise InputError(f"'{path}.choices': {twice[0]!r} equals another choice.")
-            options["choices"] = choices
+            options["choices"] = _choices(f"{path}.choices", options["choices"])
         target = f"optuna.distributions.{kind.capitalize()}Distribution"
         space[key] = build_optuna({"_target_": target, **options}, path)
     return space
 
 
-def build_optuna(node: Mapping[str, Any], path: str, **collaborators: Any) -> Any:
-    """The object of a node of Optuna; what the constructor refuses is an InputError with `path`."""
+def _choices(path: str, given: Any) -> list[Any]:
+    choices = list[Any]()
+    for value in check_value(path, given, list[Any]):
+        choice = _text(value) if isinstance(value, list) else value
+        # Optuna compares by ==, for which 1, 1.0 and true are equal: it would run another one.
+        if choice in choices:
+            raise InputError(f"'{path}': {choice!r} equals another choice.")
+        choices.append(choice)
+    return choices
+
+
+def build_optuna(node: Mapping[str, Any], path: str) -> Any:
+    """Build the object of a node; what its constructor refuses is an InputError with `path`."""
     try:
-        return Component.from_node(node, path).build(**collaborators)
+        return Component.from_node(node, path).build()
     except InputError:
         raise
     except ValueError as error:
@@ -70,17 +74,18 @@ def build_optuna(node: Mapping[str, Any], path: str, **collaborators: Any) -> An
 
 
 def ends(space: Space) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Overrides of the lowest and the highest point; of choices the first and the last."""
-    ranges = {
-        key: one.choices if isinstance(one, kinds.CategoricalDistribution) else (one.low, one.high)
-        for key, one in space.items()
-    }
-    first, last = ({key: each[place] for key, each in ranges.items()} for place in (0, -1))
-    return as_overrides(first), as_overrides(last)
+    """Return overrides of the lowest and the highest point; of choices the first and the last."""
+    lowest, highest = dict[str, Any](), dict[str, Any]()
+    for key, distribution in space.items():
+        if isinstance(distribution, kinds.CategoricalDistribution):
+            lowest[key], highest[key] = distribution.choices[0], distribution.choices[-1]
+        else:
+            lowest[key], highest[key] = distribution.low, distribution.high
+    return as_overrides(lowest), as_overrides(highest)
 
 
 def as_overrides(params: Mapping[str, Any]) -> tuple[str, ...]:
-    """``key=value`` for every value, such that Hydra reads exactly that value.
+    """Return ``key=value`` for every value, such that Hydra reads exactly that value.
 
     Text with an interpolation, and text of a list ("[48,64]"), is passed on as it is.
     """
@@ -95,7 +100,7 @@ def _text(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, list):
-        return "[" + ",".join(_text(item) for item in value) + "]"
+        return "[" + ",".join(_text(entry) for entry in value) + "]"
     if value.startswith("[") and value.endswith("]"):
         return str(value)
     try:  # whether the grammar takes the bare text as this very text, also inside a list
@@ -106,7 +111,7 @@ def _text(value: Any) -> str:
 
 
 def signature(*parts: Any) -> str:
-    """Hash of what makes a study (12 hexadecimal digits)."""
+    """Return a hash of what makes a study (12 hexadecimal digits)."""
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
 
 
@@ -129,7 +134,8 @@ def split(
     swept: SweptValues = {}
     intervals: dict[str, dict[str, Any]] = {}
     parsed = OverridesParser.create(config_loader).parse_overrides(list(overrides))
-    for key, override in {one.get_key_element(): one for one in parsed}.items():
+    last = {override.get_key_element(): override for override in parsed}
+    for key, override in last.items():
         value = override.value()
         if not override.is_sweep_override():
             fixed.append(str(override.input_line))
@@ -149,27 +155,29 @@ def split(
 
 
 def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[Point]:
-    """All combinations of the `swept` values, in Hydra's order: the last key changes fastest."""
-    return [
-        _point(fixed, [f"{key}={value}" for key, value in zip(swept, values, strict=True)])
-        for values in product(*swept.values())
-    ]
+    """Return all combinations of the `swept` values; the last key changes fastest, as in Hydra."""
+    points = []
+    for values in product(*swept.values()):
+        own = [f"{key}={value}" for key, value in zip(swept, values, strict=True)]
+        points.append(_point(fixed, own))
+    return points
 
 
 def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[Point]:
-    """Points written out one by one, so that values vary together (Hydra's issue 3082).
+    """Return points written out one by one, so that values vary together (Hydra's issue 3082).
 
     A point's own override has priority over the `fixed` one of the same key.
     """
-    taken = [{key_of(word) for word in own} for own in points]
-    return [
-        _point([word for word in fixed if key_of(word) not in keys], own)
-        for own, keys in zip(points, taken, strict=True)
-    ]
+    found = []
+    for own in points:
+        keys = {key_of(word) for word in own}
+        others = [word for word in fixed if key_of(word) not in keys]
+        found.append(_point(others, own))
+    return found
 
 
 def key_of(override: str) -> str:
-    """Key of an override as typed."""
+    """Return the key of an override as typed."""
     return override.partition("=")[0].lstrip("+~")
 
 
@@ -179,16 +187,16 @@ def merge_space(
     swept: SweptValues,
     intervals: Mapping[str, Mapping[str, Any]],
 ) -> Space:
-    """The space of a search from a file and the command line, which has priority for every key.
+    """Return the space of a search from a file and the command line, which has priority.
 
     A key that is `fixed` is not searched; `swept` values are choices.
     """
     merged = dict(entries)
     for key, texts in swept.items():
-        choices = [one.value() for one in _parsed(f"{key}={text}" for text in texts)]
+        choices = [override.value() for override in _parsed(f"{key}={text}" for text in texts)]
         merged[key] = {"type": "categorical", "choices": choices}
     merged.update(intervals)
-    keys = {one.get_key_element() for one in _parsed(fixed)}
+    keys = {override.get_key_element() for override in _parsed(fixed)}
     return parse_space({key: entry for key, entry in merged.items() if key not in keys})
 
 
@@ -198,8 +206,10 @@ def _parsed(overrides: Iterable[str]) -> list[Override]:
 
 def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
     params: dict[str, Value] = {}
-    for override in (one for one in _parsed(own) if not one.is_delete()):
+    for override in _parsed(own):
         value = override.value()
+        if override.is_delete():
+            continue
         if override.is_sweep_override():
             raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
         if not (value is None or isinstance(value, str | int | float)):
@@ -209,57 +219,32 @@ def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
 
 
 # Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
-# stop the study, which neither several drivers nor a resumed search can share.
-SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
-
-
-def _of_trial(name: str) -> Any:
-    """The method `name` of the sampler that a trial has for itself."""
-
-    def call(self: PerTrialSampler, study: Any, trial: Any, *arguments: Any) -> Any:
-        return getattr(self.of(trial.number), name)(study, trial, *arguments)
-
-    return call
-
-
-class PerTrialSampler(BaseSampler):
-    """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
-
-    Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
-    that is resumed, would propose the same points again. Here every trial has a sampler by its
-    number in the storage, which `make` makes of a seed.
-    """
-
-    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
-        self.make, self.seed = make, seed
-        self.of = lru_cache(lambda number: make(trial_seed(seed, number)))
-
-    before_trial = _of_trial("before_trial")
-    infer_relative_search_space = _of_trial("infer_relative_search_space")
-    sample_relative = _of_trial("sample_relative")
-    sample_independent = _of_trial("sample_independent")
-    after_trial = _of_trial("after_trial")
+# stop the study, which a resumed search cannot share.
+SAMPLERS = [f"optuna.samplers.{name}Sampler" for name in ("TPE", "Random", "GP", "NSGAII")]
 
 
 def trial_seed(seed: int, number: int) -> int:
-    """32-bit seed that depends on both arguments (SHA-256), the same on every machine."""
+    """Return a 32-bit seed of both arguments (SHA-256), the same on every machine."""
     digest = hashlib.sha256(f"{seed}:trial:{number}".encode()).digest()
     return int.from_bytes(digest[:4], "big")
 
 
-def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
-    """The sampler of a search, one of `SAMPLERS` with options of its constructor.
+def build_sampler(node: Mapping[str, Any], number: int) -> BaseSampler:
+    """Return the sampler of one trial, one of `SAMPLERS` with options of its constructor.
 
-    One worker with the same `seed` (0 if it has none) proposes the same points.
+    Optuna's samplers draw from one generator for all trials, so that a search that is resumed would
+    propose the same points again. Here every trial has a sampler of its own, whose seed follows
+    from the seed of the node (0 if it has none) and the `number` of the trial.
     """
     path = "hydra.sweeper.sampler"
     check_choice(f"{path}._target_", str(node.get("_target_")), SAMPLERS)
-    build_optuna(node, path)
-    return PerTrialSampler(lambda seed: build_optuna(node, path, seed=seed), node.get("seed") or 0)
+    seed = check_value(f"{path}.seed", node.get("seed") or 0, int)
+    sampler: BaseSampler = build_optuna({**node, "seed": trial_seed(seed, number)}, path)
+    return sampler
 
 
 def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
-    """The pruner of a search, any of Optuna; trials report at their validation steps.
+    """Return the pruner of a search, any of Optuna; trials report at their validation steps.
 
     Options such as ``n_warmup_steps`` count steps of the optimizer, not validations.
     """

@@ -7,7 +7,7 @@ draws it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 # Optuna's states as shown.
 WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
 WORDS |= {"RUNNING": "unfinished", "WAITING": "waiting"}
+
+# First columns of the frame of trials.
+OF_TRIAL = ("trial", "state", "label")
 
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
@@ -66,102 +69,98 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class StudyData:
-    """A study at one moment.
+def objectives(study: optuna.Study) -> dict[str, bool]:
+    """Return the names of the objectives, and whether more is better."""
+    ways = [direction.name == "MAXIMIZE" for direction in study.directions]
+    metrics = study.metric_names or [f"objective {n + 1}" for n in range(len(ways))]
+    return dict(zip(metrics, ways, strict=True))
 
-    Attributes:
-        metrics: names of the objectives, and whether more is better.
-        params: names of the parameters.
-        frame: trials that count, one a row: trial (its number), state, label, the parameters, the
-            scores in percent, objectives first, seconds, last_step, runs, reason. NaN: it has none.
+
+def parameters(study: optuna.Study, trials: pd.DataFrame) -> list[str]:
+    """Return the names of the parameters: columns between those of every trial and the scores."""
+    columns = list(trials.columns)
+    return columns[len(OF_TRIAL) : columns.index(next(iter(objectives(study))))]
+
+
+def trials_frame(study: optuna.Study) -> pd.DataFrame:
+    """Read the trials of a study at one moment, one a row.
+
+    Returns:
+        columns: trial (its number), state, label, the parameters, the scores in percent, objectives
+        first, seconds, last_step, runs, reason. NaN: the trial has none.
     """
+    import pandas as pd
 
-    study: optuna.Study
-    metrics: Mapping[str, bool]
-    params: Sequence[str]
-    frame: pd.DataFrame
+    from rgbt.config.compose import with_pixels
 
-    @classmethod
-    def read(cls, study: optuna.Study) -> StudyData:
-        """Read a study."""
-        import pandas as pd
-
-        from rgbt.config.compose import with_pixels
-
-        ways = [direction.name == "MAXIMIZE" for direction in study.directions]
-        metrics = study.metric_names or [f"objective {n + 1}" for n in range(len(ways))]
-        params, scores, rows = dict[str, None](), dict.fromkeys(metrics), []
-        for trial in study.get_trials(deepcopy=False):
-            notes, values = trial.user_attrs, zip(metrics, trial.values or (), strict=False)
-            found = {**notes.get(names.RESULTS, {}), **dict(values)}
-            factor = notes.get(names.PIXELS, 1.0)
-            chosen = {
-                name: with_pixels(value, factor) if isinstance(value, str) else value
-                for name, value in trial.params.items()
-            }
-            params, scores = params | dict.fromkeys(chosen), scores | dict.fromkeys(found)
-            of_trial = {
-                "trial": trial.number,
-                "state": WORDS[trial.state.name],
-                **chosen,
-                **found,
-                "label": notes.get(names.LABEL, f"#{trial.number}"),
-                "seconds": notes.get(names.SECONDS),
-                "last_step": trial.last_step,
-                "runs": " ".join(notes.get(names.RUNS, ())) or None,
-                "reason": " ".join(notes.get(names.REASON, "").split()) or None,
-            }
-            rows.append({name: v for name, v in of_trial.items() if v is not None})
-        columns = ["trial", "state", "label", *params, *scores, "seconds", "last_step", "runs"]
-        frame = pd.DataFrame(rows, columns=[*columns, "reason"], dtype=object)
-        return cls(study, dict(zip(metrics, ways, strict=True)), list(params), frame)
-
-    def of_state(self, state: str) -> pd.DataFrame:
-        """The trials that are in a state."""
-        return self.frame[self.frame["state"] == state]
+    metrics = objectives(study)
+    params: dict[str, None] = {}
+    scores: dict[str, Any] = dict.fromkeys(metrics)
+    rows = []
+    for trial in study.get_trials(deepcopy=False):
+        notes = trial.user_attrs
+        factor = notes.get(names.PIXELS, 1.0)
+        row: dict[str, Any] = {"trial": trial.number, "state": WORDS[trial.state.name]}
+        for name, value in trial.params.items():
+            row[name] = with_pixels(value, factor) if isinstance(value, str) else value
+        values = zip(metrics, trial.values or (), strict=False)
+        found = {**notes.get(names.RESULTS, {}), **dict(values)}
+        params |= dict.fromkeys(trial.params)
+        scores |= found
+        row |= {
+            **found,
+            "label": notes.get(names.LABEL, f"#{trial.number}"),
+            "seconds": notes.get(names.SECONDS),
+            "last_step": trial.last_step,
+            "runs": " ".join(notes.get(names.RUNS, ())) or None,
+            "reason": " ".join(notes.get(names.REASON, "").split()) or None,
+        }
+        rows.append({name: value for name, value in row.items() if value is not None})
+    columns = [*OF_TRIAL, *params, *scores, "seconds", "last_step", "runs", "reason"]
+    return pd.DataFrame(rows, columns=columns, dtype=object)
 
 
-def tables(data: StudyData) -> list[TextTable]:
-    """Trials by state, the most important trials, the failed ones; empty tables are left out."""
-    counts = data.frame["state"].value_counts()
-    row = (str(len(data.frame)), *(str(counts.get(word, 0)) for word in WORDS.values()))
-    title = f"Study {data.study.study_name}"
-    failed = data.of_state("failed")
+def tables(study: optuna.Study, trials: pd.DataFrame) -> list[TextTable]:
+    """Show trials by state, the best ones and the failed ones; empty tables are left out."""
+    counts = trials["state"].value_counts()
+    row = (str(len(trials)), *(str(counts.get(word, 0)) for word in WORDS.values()))
+    failed = trials[trials["state"] == "failed"]
     failed = failed.assign(reason=failed["reason"].map(one_line))
     found = [
-        TextTable(title, ("trials", *WORDS.values()), (row,)),
-        trials_grid(data),
+        TextTable(f"Study {study.study_name}", ("trials", *WORDS.values()), (row,)),
+        trials_grid(study, trials),
         _grid("Failed trials", failed, dict.fromkeys(("reason", "trial", "label", "runs"))),
     ]
     return [grid for grid in found if grid.rows]
 
 
-def trials_grid(data: StudyData) -> TextTable:
-    """The best `TOP` trials by the objective, or the Pareto front of several objectives."""
+def trials_grid(study: optuna.Study, trials: pd.DataFrame) -> TextTable:
+    """Show the best `TOP` trials by the objective, or the Pareto front of several objectives."""
     from sweeps.point import short_names
 
-    complete, (metric, is_up) = data.of_state("complete"), next(iter(data.metrics.items()))
+    metrics = objectives(study)
+    metric, is_up = next(iter(metrics.items()))
+    complete = trials[trials["state"] == "complete"]
     best = complete.sort_values(metric, ascending=not is_up, kind="stable")
-    if len(data.metrics) == 1:
+    if len(metrics) == 1:
         way = "highest" if is_up else "lowest"
         title, shown = f"Best trials: {way} {metric}", best.head(TOP)
     else:
-        front = [trial.number for trial in data.study.best_trials]
+        front = [trial.number for trial in study.best_trials]
         shown = best[best["trial"].isin(front)]
         title = f"Pareto front: {len(shown)} of {len(complete)} complete trials"
-    what = short_names(data.params)
+    columns: dict[str, str | None] = {"trial": None, **short_names(parameters(study, trials))}
     # Objectives and the scores of `ALWAYS`, validation and test side by side.
-    ends = [metric.removeprefix("val/").removeprefix("test/") for metric in data.metrics]
-    wanted = [f"{split}{end}" for end in (*ends, *ALWAYS) for split in ("", "val/", "test/")]
-    scores = [name for name in dict.fromkeys(wanted) if name in shown and shown[name].notna().any()]
-    return _grid(
-        title, shown, {"trial": None, **what, **dict.fromkeys((*scores, "seconds", "runs"))}
-    )
+    ends = [metric.removeprefix("val/").removeprefix("test/") for metric in metrics]
+    for end in (*ends, *ALWAYS):
+        for name in (end, f"val/{end}", f"test/{end}"):
+            if name in shown and shown[name].notna().any():
+                columns[name] = None
+    return _grid(title, shown, columns | {"seconds": None, "runs": None})
 
 
-def importances(data: StudyData) -> tuple[TextTable | None, str]:
-    """How much the objectives depend on each parameter, by PED-ANOVA: of reaching the best tenth.
+def importances(study: optuna.Study, trials: pd.DataFrame) -> tuple[TextTable | None, str]:
+    """Compute how much parameters matter for a trial to be in the best tenth, by PED-ANOVA.
 
     Returns:
         shares in percent by objective, the most important parameter for the first one first; or
@@ -172,12 +171,12 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
     import pandas as pd
     from optuna.importance import get_param_importances
 
-    complete = data.of_state("complete")
+    complete = trials[trials["state"] == "complete"]
     if len(complete) < MIN_TRIALS:
         return None, f"they need {MIN_TRIALS} complete trials, and there are {len(complete)}."
-    varied = [name for name in data.params if complete[name].nunique() > 1]
+    varied = [name for name in parameters(study, trials) if complete[name].nunique() > 1]
     found = {}
-    for place, (metric, is_up) in enumerate(data.metrics.items()):
+    for place, (metric, is_up) in enumerate(objectives(study).items()):
 
         def loss(trial: Any, place: int = place, is_up: bool = is_up) -> float:  # less is better
             return float(-trial.values[place] if is_up else trial.values[place])
@@ -185,7 +184,7 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
         if varied and complete[metric].nunique() > 1:
             with warnings.catch_warnings():  # about the sign, and about few trials
                 warnings.simplefilter("ignore")
-                found[metric] = get_param_importances(data.study, params=varied, target=loss)
+                found[metric] = get_param_importances(study, params=varied, target=loss)
     if not found:
         return None, "no parameter, or no objective, took two values."
     shares = (100 * pd.DataFrame(found)).map("{:.2f}".format).reset_index()
@@ -195,7 +194,7 @@ def importances(data: StudyData) -> tuple[TextTable | None, str]:
 
 
 def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) -> TextTable:
-    """Columns of a frame, some under other names, as text."""
+    """Write columns of a frame, some under other names, as text."""
     import pandas as pd
 
     def text(name: str, value: object) -> str:
@@ -216,11 +215,14 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     from rgbt.runs.provenance import without_passwords
     from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
 
-    data = StudyData.read(study)
-    important, remark = importances(data)
-    grids = [*tables(data), *([important] if important else [])]
+    trials = trials_frame(study)
+    grids = tables(study, trials)
+    important, remark = importances(study, trials)
+    grids += [important] if important else []
     out.mkdir(parents=True, exist_ok=True)
-    ways = (f"{'highest' if up else 'lowest'} {metric}" for metric, up in data.metrics.items())
+    ways = []
+    for metric, is_up in objectives(study).items():
+        ways.append(f"{'highest' if is_up else 'lowest'} {metric}")
     command = without_passwords(study.user_attrs.get(names.COMMAND, ""))
     remarks = [f"Importances: {remark}"] if remark else []
     text = [
@@ -231,8 +233,7 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
         *remarks,
     ]
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
-    every = data.frame.to_csv(index=False)
-    write_atomic(out / "trials.csv", every.encode())
+    write_atomic(out / "trials.csv", trials.to_csv(index=False).encode())
     print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
     lines = [("report", str(out / "study.md"))]
     if find_spec("optuna_dashboard"):

@@ -8,12 +8,13 @@ from __future__ import annotations
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
+import optuna
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
+from optuna.exceptions import StorageInternalError
 from rich.console import Group
 
 from rgbt.checks import InputError, RunError
@@ -22,11 +23,10 @@ from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps import attributes as names
 from sweeps import space as spaces
+from sweeps.plan.planner import Planner, specify_run
 from sweeps.point import Point, short_names
-from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.run import point_list
 from sweeps.run.driver import drive
-from sweeps.run.executors import check_launcher
 from sweeps.run.optuna_study import (
     driving,
     known_studies,
@@ -35,17 +35,20 @@ from sweeps.run.optuna_study import (
     storage_url,
     study_folder,
 )
-from sweeps.run.planner import Planner, specify_run
 from sweeps.run.point_list import PointList
 from sweeps.run.progress import ProgressView, duration
 from sweeps.run.run_store import RunStore, open_run_store
 from sweeps.run.search_source import SearchSource
-from sweeps.settings import SweepSettings, read_launcher, read_settings
+from sweeps.settings import SweepSettings, read_settings
+from sweeps.show.seed_groups import group_grid, unfinished_grid
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
 from sweeps.study import publish_study
 
 # Beginnings of overrides that may differ between two calls of the same sweep.
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
+
+# Settings that have no effect on a grid or a list.
+OF_SEARCHES = ("trials", "hours", "pruner", "storage")
 
 
 def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:
@@ -53,12 +56,12 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
 
     InputError: invalid settings, space or points. RunError: points failed; all others were run.
     """
-    settings = read_settings(config.hydra.sweeper, read_launcher(config.hydra))
-    check_launcher(settings.launcher)
+    settings = read_settings(config.hydra)
     runs = open_run_store(config)
-    # Text of `params` stands as it would be typed, other values as Hydra reads them.
-    params = settings.params.items()
-    typed = [f"{k}={v}" if isinstance(v, str) else as_overrides({k: v})[0] for k, v in params]
+    typed = []
+    for key, value in settings.params.items():
+        # Text of `params` stands as it would be typed, other values as Hydra reads them.
+        typed.append(f"{key}={value}" if isinstance(value, str) else as_overrides({key: value})[0])
     # `fresh` is for the sweep, which decides for each point: no setting of its runs.
     typed += [word for word in arguments if word.partition("=")[0] != "fresh"]
     fixed, swept, intervals = spaces.split(typed, loader)
@@ -76,43 +79,42 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         search(Search(name, (*base, *fixed), space, runs, identity), settings)
         return
 
-    ours = ("trials", "hours", "pruner", "storage")
-    unused = [key for key in ours if getattr(settings, key) is not None]
-    if unused or settings.replicates > 1:
-        key = [*unused, "replicates"][0]
-        raise InputError(f"hydra.sweeper.{key} is for a search, but no key has a range.")
-    grid = spaces.grid_points(fixed, swept)
-    if settings.points:
-        grid = [
-            replace(own, params={**each.params, **own.params})
-            for each in grid
-            for own in spaces.list_points(settings.points, each.overrides)
-        ]
-    identity = signature([_plain(each.overrides) for each in grid])
+    unused = [key for key in OF_SEARCHES if getattr(settings, key) is not None]
+    if settings.replicates > 1:
+        unused.append("replicates")
+    if unused:
+        raise InputError(f"hydra.sweeper.{unused[0]} is for a search, but no key has a range.")
+    grid = []
+    for point in spaces.grid_points(fixed, swept):
+        if not settings.points:
+            grid.append(point)
+        for own in spaces.list_points(settings.points, point.overrides):
+            grid.append(replace(own, params={**point.params, **own.params}))
+    identity = signature([_plain(point.overrides) for point in grid])
     name = settings.study or _name(config.name, list(grid[0].params), identity)
     tags = {f"rgbt.study/{name}": "grid"}
-    points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
-    _grid(PointList(name, name, points, runs, Planner(base)), settings)
+    points = tuple(replace(point, label=_label(point) or name, tags=tags) for point in grid)
+    _run_grid(PointList(name, name, points, runs, Planner(base)), settings)
 
 
 def _label(point: Point) -> str:
-    """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
+    """Return the varied values of a point, as typed: "sigma_div=1 seed=0"."""
     values = {key.lstrip("+"): value for key, value in point.params.items()}
     return " ".join(f"{name}={values[key]}" for key, name in short_names(values).items())
 
 
 def _name(experiment: str, keys: Iterable[str], identity: str) -> str:
-    """A reproducible name: the method, the varied keys, a hash of everything."""
+    """Return a reproducible name: the method, the varied keys, a hash of everything."""
     varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
     return "-".join(word for word in (experiment, varied[:60], identity[:6]) if word)
 
 
 def _plain(words: Sequence[str]) -> list[str]:
-    """Overrides without those that are only paths."""
+    """Return overrides without those that are only paths."""
     return [word for word in words if not key_of(word).startswith(PATHS)]
 
 
-def _grid(points: PointList, settings: SweepSettings) -> None:
+def _run_grid(points: PointList, settings: SweepSettings) -> None:
     if settings.commands is not None:
         info(point_list.commands_line(points, settings))
         return
@@ -127,7 +129,7 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
     tables = [unfinished_grid(outcomes)]
     if any(outcome.results for outcome in outcomes):
         tables.insert(0, group_grid(points.title, outcomes))
-    print_rich(Group(*(rich_table(each) for each in tables if each.rows)))
+    print_rich(Group(*(rich_table(table) for table in tables if table.rows)))
     if other_code := point_list.other_code_line(outcomes):
         info(other_code)
     if settings.dry_run:
@@ -146,7 +148,7 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
 
 @dataclass(frozen=True)
 class Search:
-    """A search to run.
+    """Describes a search to run.
 
     `fixed` are overrides that all trials share; `identity` is a signature of what must not change
     in a study, to which the data set is added.
@@ -163,49 +165,51 @@ def search(request: Search, settings: SweepSettings) -> None:
     """Run trials until the budget is spent, then report the study.
 
     InputError: settings that do not fit, or a study of that name with another space. RunError: no
-    trial has finished.
+    trial has finished, or the storage cannot be reached any more.
     """
     if settings.trials is None and settings.hours is None:
         raise InputError("a search needs hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both.")
     if settings.commands is not None:
         raise InputError("hydra.sweeper.commands is for grids, lists and tables: a search decides.")
-    samplers = {"sampler": build_sampler(settings.sampler), "pruner": build_pruner(settings.pruner)}
+    build_sampler(settings.sampler, 0)  # refuses wrong options before anything is written
+    build_pruner(settings.pruner)
     is_reported = len(settings.objectives) == 1 and settings.objectives[0].is_reported
     if settings.pruner is not None and not is_reported:
         raise InputError("hydra.sweeper.pruner needs one objective that is reported, as val/mIoU.")
     runs_dir = request.runs.runs_dir
+    url = storage_url(settings.storage, runs_dir, request.study)
     if settings.dry_run:
-        url = storage_url(settings.storage, runs_dir, request.study)
         known = known_studies(url, runs_dir).get(request.study)
         done = 0 if known is None else len(known.get_trials(deepcopy=False))
-        space = "".join(f"{key}: {one}\n" for key, one in request.space.items())
         total = settings.trials or "any number of"
-        sys.stdout.write(f"{space}study {request.study}: {done} of {total} trials exist.\n")
+        for key, distribution in request.space.items():
+            sys.stdout.write(f"{key}: {distribution}\n")
+        sys.stdout.write(f"study {request.study}: {done} of {total} trials exist.\n")
         return
-    if settings.launcher.name in ("submitit_slurm", "ray") and settings.workers is None:
+    if settings.launcher in ("submitit_slurm", "ray") and settings.workers is None:
         raise InputError(
-            f"a search with hydra/launcher={settings.launcher.name} needs hydra.sweeper.workers=8: "
+            f"a search with hydra/launcher={settings.launcher} needs hydra.sweeper.workers=8: "
             "how many trials are tried at once."
         )
     dataset = probe(request, settings).dataset
+    attributes = {names.SIGNATURE: signature(request.identity, dataset)}
     with driving(runs_dir, request.study) as is_ours:
         if is_ours:
-            _run_trials(request, settings, signature(request.identity, dataset), samplers)
+            study = open_study(request.study, open_storage(url), settings.objectives, attributes)
+            _run_trials(request, settings, study)
+            publish_study(study, study_folder(runs_dir, request.study), url)
 
 
-def _run_trials(
-    request: Search, settings: SweepSettings, identity: str, samplers: Mapping[str, Any]
-) -> None:
-    runs_dir = request.runs.runs_dir
-    url = storage_url(settings.storage, runs_dir, request.study)
-    attributes = {names.SIGNATURE: identity}
-    objectives = settings.objectives
-    study = open_study(request.study, open_storage(url), objectives, attributes, **samplers)
+def _run_trials(request: Search, settings: SweepSettings, study: optuna.Study) -> None:
+    study.pruner = build_pruner(settings.pruner)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     view = ProgressView(request.study)
-    source = SearchSource(request.fixed, request.space, study, settings, view.say)
-    drive(view, source, request.runs, settings)
+    source = SearchSource(request.fixed, request.space, study, settings, request.runs, view.say)
+    try:
+        drive(view, source, request.runs, settings)
+    except StorageInternalError as error:
+        raise RunError(f"storage: {str(error).splitlines()[0]}; rerun the command.") from error
 
     trials = study.get_trials(deepcopy=False)
     states = Counter(trial.state.name for trial in trials)
@@ -213,18 +217,18 @@ def _run_trials(
         info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
-    publish_study(study, study_folder(runs_dir, request.study), url)
 
 
 def probe(request: Search, settings: SweepSettings) -> RunSpec:
-    """The run at the lowest point of the space; the highest one is checked too.
+    """Return the run at the lowest point of the space; the highest one is checked too.
 
     Both refuse what the runs would: an end of a range that a setting does not accept, a missing
     data set, or an objective that the runs do not measure.
     """
     planner = Planner()
     low, high = spaces.ends(request.space)
-    lowest, highest = planner.specify((*request.fixed, *low)), specify_run((*request.fixed, *high))
+    lowest = planner.specify((*request.fixed, *low))
+    highest = specify_run((*request.fixed, *high))
     planner.fingerprint(lowest)
     views, trainer = lowest.consistency.values, highest.trainer
     measured = views["splits"] if views["sets"] else ()

@@ -7,7 +7,7 @@ from functools import cache
 from rgbt.config.compose import compose
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify
-from sweeps.table.table import Row, Table
+from sweeps.plan.table import Row, Table
 
 
 @cache

@@ -197,7 +197,7 @@ def data(write_mfnet: Callable[..., Path]) -> Path:
 @pytest.fixture(scope="module")
 def composed_once() -> Iterator[None]:
     """The runs of rows are composed once for a module, whatever folder they are in."""
-    from sweeps.run import planner
+    from sweeps.plan import planner
 
     once = cache(planner.specify_run)
 

@@ -58,12 +58,12 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    "sweeps.run": {"sweeps.space"},
     "sweeps.space": set(),
-    "sweeps.report": {f"sweeps.{e}" for e in ("run", "table", "verdicts", "rendering")},
-    "sweeps.table": {"sweeps.run"},
-    "sweeps.verdicts": {"sweeps.table", "sweeps.run"},
-    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "run", "verdicts")},
+    "sweeps.plan": {"sweeps.space"},
+    "sweeps.run": {f"sweeps.{room}" for room in ("space", "plan")},
+    "sweeps.score": {f"sweeps.{room}" for room in ("plan", "run")},
+    "sweeps.judge": {f"sweeps.{room}" for room in ("plan", "run", "score")},
+    "sweeps.show": {f"sweeps.{room}" for room in ("plan", "run", "score", "judge")},
     "analysis.predictions": set(),
     "analysis.uncertainty": set(),
     "analysis.statistics": {"analysis.uncertainty"},

@@ -86,10 +86,10 @@ def test_openmp_of_the_runs_of_a_sweep_has_read_the_value(
 SWEEP = """
 import time
 from pathlib import Path
-from sweeps.run.job import Step, Work
+from sweeps.run.job import Work
 from sweeps.run.local import LocalExecutor
 executor = LocalExecutor({workers})
-(job,) = executor.submit([Work("key", (Step(("this",), Path()),), {{}}, Path("log"), Path.cwd())])
+(job,) = executor.submit([Work("key", {{("this",): None}}, {{}}, Path("log"), Path.cwd())])
 while executor.state(job) == "running":
     time.sleep(0.05)
 """

@@ -23,12 +23,12 @@ from rgbt.runs.folder import RunFolder, read_description, read_result
 from rgbt.runs.result import RunResult
 from rgbt.tracking.sync import entry as sync
 from sweeps.claims import entry as claims
-from sweeps.report.__main__ import entry as report
+from sweeps.judge import stored_tables
+from sweeps.plan.request import REQUESTED, TAG
+from sweeps.report import entry as report
 from sweeps.reproduce import entry as reproduce
 from sweeps.run.optuna_study import open_storage, storage_url, study_folder
 from sweeps.study import entry as study
-from sweeps.table.request import REQUESTED, TAG
-from sweeps.verdicts import stored
 from tests.commands import Call, Trained, short
 from tests.measured import remeasured
 
@@ -158,8 +158,8 @@ def test_no_command_composes_a_stored_word(
     monkeypatch.chdir(root)
     monkeypatch.syspath_prepend(str(root))
     monkeypatch.setenv("TOKEN", SECRET)
-    monkeypatch.setattr(stored, "table_names", lambda: [TABLE])
-    monkeypatch.setattr(stored, "study_names", list)
+    monkeypatch.setattr(stored_tables, "table_names", lambda: [TABLE])
+    monkeypatch.setattr(stored_tables, "study_names", list)
     composed: list[str] = []
     divided = compose._divided
 

@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.commands import short, words_of
+from tests.sweeps import clusters
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(params=["submitit_local", "submitit_slurm"])
-def launcher(request: pytest.FixtureRequest) -> str:
-    """Its name; skipped where it cannot run. Nodes of SLURM have to see the folder of the test."""
+@pytest.fixture(scope="module", params=["submitit_local", "submitit_slurm"])
+def launcher(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Its name; skipped where it cannot run."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    if request.param == "submitit_slurm":
-        if shutil.which("sinfo") is None:
-            pytest.skip("SLURM is not installed: there is no sinfo")
-        listed = subprocess.run(["sinfo", "-h"], capture_output=True, text=True)
-        if not any(state in listed.stdout for state in ("idle", "mix", "alloc")):
-            pytest.skip(f"sinfo shows no node: {listed.stdout or listed.stderr}")
-    return request.param
+    if request.param == "submitit_local":
+        yield request.param
+        return
+    with clusters.slurm():
+        yield request.param
 
 
 def grid(launcher: str, data: Path, runs: Path, *words: str) -> tuple[int, str]:
@@ -58,7 +57,7 @@ def test_points_are_trained_in_jobs(launcher: str, data: Path, tmp_path: Path) -
     assert code == 0, err
     results = list(runs.glob("*/result.json"))
     assert len(results) == 2
-    jobs = {each.name for each in (runs / ".multirun" / ".submitit").glob("*/*_result.pkl")}
+    jobs = {path.name for path in (runs / ".multirun" / ".submitit").glob("*/*_result.pkl")}
     assert len(jobs) == 2
 
 

@@ -22,15 +22,15 @@ SCHEME = "rgbt"
 
 
 class RgbtConfigSource(ConfigSource):
-    """A folder whose files are parsed once and may hold several choices: `rgbt.config.compose`."""
+    """Reads a folder whose files may hold several choices, each file once (`config.compose`)."""
 
     @staticmethod
     def scheme() -> str:
-        """The beginning of its paths."""
+        """Return the beginning of its paths."""
         return SCHEME
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """The values of a choice such as "model/cmx_b0"."""
+        """Return the values of a choice such as "model/cmx_b0"."""
         from rgbt.config.compose import parsed
 
         return parsed(self.path, self.provider, config_path)
@@ -50,13 +50,14 @@ class RgbtConfigSource(ConfigSource):
         return self.is_group("")
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Names of the groups and choices in a group, sorted."""
+        """Return the names of the groups and choices in a group, sorted."""
         from rgbt.config.compose import choices_in
 
         folder = Path(self.path, config_path)
         found = set() if results_filter == ObjectType.GROUP else choices_in(folder)
         if results_filter != ObjectType.CONFIG:
-            found |= {e.name for e in folder.iterdir() if e.is_dir() and e.name != "__pycache__"}
+            groups = [path.name for path in folder.iterdir() if path.is_dir()]
+            found |= set(groups) - {"__pycache__"}
         return sorted(found)
 
 
@@ -69,7 +70,9 @@ class RgbtSearchPath(SearchPathPlugin):
         if compose is None:  # without its resolvers nobody can compose rgbt's files
             return
         elements = search_path.get_path()
-        for main in [each for each in elements if each.provider == "main" and each.path]:
+        for main in [
+            element for element in elements if element.provider == "main" and element.path
+        ]:
             path = main.path.removeprefix("file://")
             if Path(path).resolve() != compose.conf_dir().resolve():
                 continue

@@ -42,7 +42,7 @@ class StudySweeper(Sweeper):
 
 
 class RayLauncher(Launcher):
-    """The settings of ``conf/hydra/launcher/ray.yaml``, which `StudySweeper` alone reads."""
+    """Takes the settings of ``conf/hydra/launcher/ray.yaml``, which `StudySweeper` alone reads."""
 
     def __init__(self, **settings: Any) -> None:
         del settings
@@ -50,7 +50,7 @@ class RayLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """InputError: another sweeper wants to launch jobs with it."""
+        """Refuse another sweeper, which wants to launch jobs with it, by an InputError."""
         del hydra_context, task_function, config
         from rgbt.checks import InputError
 
@@ -59,5 +59,5 @@ class RayLauncher(Launcher):
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        """Never called, see `setup`."""
+        """Do nothing: it is never called, see `setup`."""
         raise NotImplementedError

@@ -40,7 +40,7 @@ COMMANDS = {
     "reproduce": Entry("sweeps.reproduce", "run a published table; new: write your own"),
     "claims": Entry("sweeps.claims", "print the claims of the papers with their verdicts"),
     "study": Entry("sweeps.study", "report a search, also while it runs"),
-    "report": Entry("sweeps.report.__main__", "write pages of finished runs, tables and claims"),
+    "report": Entry("sweeps.report", "write pages of finished runs, tables and claims"),
     "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
     "details": Entry("analysis.details", "show boundary, calibration, distance and size scores"),
     "score": Entry("analysis.score", "score predictions of any method by region"),

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.config.command import LAUNCHERS
 from sweeps.run.job import Work
 from sweeps.run.local import LocalExecutor
-from sweeps.settings import GpuSlot, Launcher
-
-WORKING = ("basic", "submitit_local", "submitit_slurm", "ray")
+from sweeps.settings import SweepSettings
 
 
 class Executor(Protocol):
@@ -32,30 +27,25 @@ class Executor(Protocol):
         """Remove a job that is queued; let one that runs save its step and end."""
 
 
-def check_launcher(launcher: Launcher) -> None:
-    """InputError: a launcher with which a sweep does not work, or its packages are missing."""
-    name = launcher.name
-    if name not in WORKING:
-        hint = f" ({LAUNCHERS[name]})" if name in LAUNCHERS else ""
-        raise InputError(f"hydra/launcher={name}: a sweep works with {', '.join(WORKING)}{hint}.")
-    if name == "ray" and find_spec("ray") is None:
-        raise InputError("hydra/launcher=ray: it needs pip install 'rgbt[ray]'.")
-
-
-def open_executor(
-    launcher: Launcher, workers: int | None, gpus: Sequence[GpuSlot] | None
-) -> Executor:
-    """The executor of a launcher with at most `workers` jobs; InputError as of its settings."""
-    check_launcher(launcher)
-    if gpus is not None and launcher.name != "basic":
-        raise InputError(f"gpus={gpus}: hydra/launcher={launcher.name} chooses the GPUs of a job.")
-    if launcher.name == "basic":
-        return LocalExecutor(workers or 1, gpus)
-    if launcher.name == "ray":
+def open_executor(settings: SweepSettings) -> Executor:
+    """Return the executor of the launcher; InputError: its settings are wrong."""
+    executor: Executor
+    if settings.gpus is not None and settings.launcher != "basic":
+        raise InputError(
+            f"gpus={list(settings.gpus)}: hydra/launcher={settings.launcher} chooses the GPUs of a "
+            "job."
+        )
+    if settings.launcher == "basic":
+        executor = LocalExecutor(settings.workers or 1, settings.gpus)
+    elif settings.launcher == "ray":
         from sweeps.run.ray_tasks import RayExecutor
 
-        return RayExecutor(launcher.options, workers or sys.maxsize)
-    from sweeps.run.submitit_jobs import SubmititExecutor
+        executor = RayExecutor(settings.launcher_options, settings.workers)
+    else:
+        from sweeps.run.submitit_jobs import SubmititExecutor
 
-    cluster = launcher.name.removeprefix("submitit_")
-    return SubmititExecutor(cluster, launcher.options, workers)
+        cluster = settings.launcher.removeprefix("submitit_")
+        executor = SubmititExecutor(cluster, settings.launcher_options, settings.workers)
+    if not settings.wait and not executor.is_lasting:
+        raise InputError("wait=false: these runs end with the command; SLURM's and Ray's do not.")
+    return executor

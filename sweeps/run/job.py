@@ -1,6 +1,6 @@
-"""What a job does on any machine: the commands of a point, each in a process of its own.
+"""What a job does on any machine: it executes the commands of a point, each in its own process.
 
-A job knows words alone. The run folder says what is done and at which step a run resumes, so that a
+A job gets words alone. The run folder says what is done and at which step a run resumes, so that a
 job may be stopped, repeated, or started twice.
 """
 
@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from rgbt.checks import one_line
 from rgbt.files.atomic import is_held
@@ -29,60 +28,64 @@ TRAINING = "rgbt.run"
 SAYS, STARTED, DONE = "rgbt job: ", "started", "done"
 
 
-class Step(NamedTuple):
-    """A command (``python -m <words>``) about a run folder."""
-
-    words: tuple[str, ...]
-    folder: Path
-
-
 @dataclass(frozen=True)
 class Work:
-    """A point as an executor gets it.
+    """Tells an executor what to do for a point.
 
     Attributes:
         key: of the point, unique in the folder of runs.
-        steps: its commands, one after another until one fails.
+        steps: words of its commands (``python -m <words>``), executed in their order until one
+            fails -> the folder of the run that a command trains, None for another command.
         environment: variables that the commands get.
         log: file to which their output is appended.
         folder: working folder.
     """
 
     key: str
-    steps: tuple[Step, ...]
+    steps: Mapping[tuple[str, ...], Path | None]
     environment: Mapping[str, str]
     log: Path
     folder: Path
 
 
-class Child(NamedTuple):
-    """The process of a command; `reap` forgets it when it has ended."""
+# Starts a command of a point: its process id, and a function that forgets a process that has ended.
+Start = Callable[[Work, Sequence[str]], tuple[int, Callable[[], object]]]
 
-    pid: int
-    reap: Callable[[], object]
+
+def start_python(work: Work, words: Sequence[str]) -> tuple[int, Callable[[], object]]:
+    """Start a command in a new interpreter."""
+    with work.log.open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", __name__, str(os.getpid()), *words],
+            stdout=log,
+            stderr=log,
+            env={**os.environ, **work.environment},
+            cwd=work.folder,
+        )
+    return process.pid, process.wait
 
 
 class Job:
-    """Executes a point; a callable without a state, which submitit and Ray pickle."""
+    """Executes the commands of a point; only its work is pickled, by submitit and Ray."""
 
     poll_s = 0.5
 
-    def __init__(self, work: Work) -> None:
-        self.work = work
+    def __init__(self, work: Work, start: Start = start_python) -> None:
+        self.work, self._start = work, start
         self.is_stopped = False  # nothing more is started, and the present command is stopped
-        self._child: Child | None = None
+        self._pid: int | None = None  # of the present command
 
     def __reduce__(self) -> tuple[type[Job], tuple[Work]]:
         return type(self), (self.work,)
 
     def __call__(self) -> int:
-        """Execute the steps; 0, or the exit code of the one that failed (negative: a signal)."""
+        """Execute the commands; 0, or the exit code of the one that failed (negative: a signal)."""
         self.work.log.parent.mkdir(parents=True, exist_ok=True)
         self._say(f"{STARTED} on {os.uname().nodename}")
         code = 0
         try:
-            for step in self.work.steps:
-                code = code or self._execute(step)
+            for words, run_folder in self.work.steps.items():
+                code = code or self._execute(words, run_folder)
         except BaseException as error:  # a time limit, or Ray cancels: the run saves its step first
             self.stop()
             if isinstance(error, Exception):  # submitit: no more time limits
@@ -94,23 +97,11 @@ class Job:
     def stop(self) -> None:
         """Let the present command save and end; returns when it has ended."""
         self.is_stopped = True
-        if self._child is not None:
-            self._wait(self._child)
+        if self._pid is not None:
+            self._wait(self._pid)
 
     def check(self) -> None:
-        """Called again and again while a command runs."""
-
-    def start(self, words: Sequence[str]) -> Child:
-        """Start a command."""
-        with self.work.log.open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", __name__, str(os.getpid()), *words],
-                stdout=log,
-                stderr=log,
-                env={**os.environ, **self.work.environment},
-                cwd=self.work.folder,
-            )
-        return Child(process.pid, process.wait)
+        """Do nothing; it is called again and again while a command runs."""
 
     def _say(self, text: str) -> None:
         with self.work.log.open("ab+") as log:
@@ -119,38 +110,41 @@ class Job:
             begin = "" if log.read(1) in (b"", b"\n") else "\n"  # a command was killed in a line
             log.write(f"{begin}{SAYS}{text}\n".encode())
 
-    def _execute(self, step: Step) -> int:
-        lock, is_training = step.folder / "lock", step.words[0] == TRAINING
+    def _execute(self, words: Sequence[str], run_folder: Path | None) -> int:
         while True:
             # Another job, or a command of the user, trains the same run: its result is ours.
-            while is_training and is_held(lock) and not self.is_stopped:
+            while self._is_held(run_folder) and not self.is_stopped:
                 time.sleep(self.poll_s)
                 self.check()
             if self.is_stopped:
                 return 128 + signal.SIGTERM
-            if is_training and is_finished(step.folder):
+            if run_folder is not None and is_finished(run_folder):
                 return 0
-            child = self._child = self.start(step.words)
-            code = self._wait(child)
-            self._child = None  # before it is reaped: a handler of a signal may come in between
-            child.reap()
-            if code == 0 or not (is_training and is_held(lock)):
+            self._pid, reap = self._start(self.work, words)
+            code = self._wait(self._pid)
+            self._pid = None  # before it is reaped: a handler of a signal may come in between
+            reap()
+            if code == 0 or not self._is_held(run_folder):
                 return code
 
-    def _wait(self, child: Child) -> int:
+    def _is_held(self, run_folder: Path | None) -> bool:
+        return run_folder is not None and is_held(run_folder / "lock")
+
+    def _wait(self, pid: int) -> int:
         # The process stays known until it is reaped: a handler of a signal may wait for it too.
-        options, is_told = os.WEXITED | os.WNOHANG | os.WNOWAIT, False
-        while (end := os.waitid(os.P_PID, child.pid, options)) is None:
-            if self.is_stopped and not is_told:
-                os.kill(child.pid, signal.SIGTERM)
-                is_told = True
+        options = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        has_signalled = False
+        while (end := os.waitid(os.P_PID, pid, options)) is None:
+            if self.is_stopped and not has_signalled:
+                os.kill(pid, signal.SIGTERM)
+                has_signalled = True
             time.sleep(self.poll_s)
             self.check()
         return end.si_status if end.si_code == os.CLD_EXITED else -end.si_status
 
 
 def how_ended(code: int) -> str:
-    """An exit code in words."""
+    """Return an exit code in words."""
     if code >= 0:
         return f"exit code {code}" if code else DONE
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
@@ -163,7 +157,7 @@ STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, s
 
 
 def failure_reason(log: Path, begin: int) -> str:
-    """Why a job failed: the last message in its log behind byte `begin`; "": done."""
+    """Return why a job failed: the last message in its log behind byte `begin`; "": done."""
     text = read_bytes(log)[begin:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     end = _end(lines)
@@ -177,7 +171,7 @@ def failure_reason(log: Path, begin: int) -> str:
 
 
 def failed_before(log: Path) -> str:
-    """Why the last job with this log failed by itself; "": it did not, or nobody stopped it."""
+    """Return why the last job with this log failed by itself; "": it did not, or was stopped."""
     if not log.exists():
         return ""
     content = read_bytes(log)
@@ -189,12 +183,12 @@ def failed_before(log: Path) -> str:
 
 def _end(lines: Sequence[str]) -> str:
     said = [line.removeprefix(SAYS) for line in lines if line.startswith(SAYS)]
-    ends = [each for each in said if not each.startswith(STARTED)]
+    ends = [text for text in said if not text.startswith(STARTED)]
     return ends[-1] if ends else LOST
 
 
 def become(words: Sequence[str]) -> None:
-    """Become ``python -m <words>``; leaves by SystemExit, or returns."""
+    """Turn this process into ``python -m <words>``; leaves by SystemExit, or returns."""
     sys.argv = list(words)
     sys.orig_argv = [sys.executable, "-m", *words]
     runpy.run_module(words[0], run_name="__main__", alter_sys=True)

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.process import BaseProcess
@@ -22,17 +22,17 @@ from rgbt.checks import InputError, RunError
 from rgbt.cores import sleep_while_waiting
 from rgbt.runs.source_code import counted_modules
 from rgbt.runtime.group import end_with_parent
-from sweeps.run.job import Child, Job, Step, Work, become, failure_reason
+from sweeps.run.job import Job, Work, become, failure_reason
 from sweeps.settings import GpuSlot
 
 CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.run.preload"
 GPUS = "CUDA_VISIBLE_DEVICES"
-# Time between SIGTERM and SIGKILL of a job that is cancelled.
-GRACE_S = 20.0
+# Time between SIGTERM and SIGKILL of a job that is cancelled, and between two looks at a process.
+GRACE_S, POLL_S = 20.0, 0.05
 
 
 class LocalExecutor:
-    """Jobs as processes of this machine, `slots` at a time; the n-th slot sees the n-th `gpus`."""
+    """Executes jobs on this machine, `slots` at a time; the n-th slot sees the n-th of `gpus`."""
 
     is_lasting = False
 
@@ -42,12 +42,12 @@ class LocalExecutor:
         check_gpus(gpus)
         self.slots, self._gpus = slots, gpus
         self._context = multiprocessing.get_context("forkserver")
-        self._processes: dict[str, BaseProcess] = {}
-        self._of_slot: dict[int, str] = {}
-        self._kill_at: dict[str, float] = {}
+        self._processes: dict[str, BaseProcess] = {}  # by job
+        self._jobs: dict[int, str] = {}  # the last one of each slot
+        self._kill_at: dict[str, float] = {}  # by job
 
     def submit(self, works: Sequence[Work]) -> list[str]:
-        """Start jobs; their names. RunError: the machine starts no process."""
+        """Start jobs and return their names. RunError: the machine starts no process."""
         return [self._start(work) for work in works]
 
     def state(self, job: str) -> str:
@@ -67,8 +67,9 @@ class LocalExecutor:
         # The user's own modules that planned points have read are imported too. This has no effect
         # once the server runs.
         self._context.set_forkserver_preload([CWD_LAST, *counted_modules(), PRELOADED])
-        free = (slot for slot in range(self.slots) if not self._is_busy(slot))
-        slot = next(free, 0)
+        slot = 0
+        while slot in self._jobs and self.state(self._jobs[slot]) == "running":
+            slot += 1
         if self._gpus:
             variables = {GPUS: ",".join(gpus_of(self._gpus[slot % len(self._gpus)]))}
             work = replace(work, environment={**work.environment, **variables})
@@ -78,32 +79,16 @@ class LocalExecutor:
         except OSError as error:
             raise RunError(f"its process could not be started ({error})") from error
         job = str(process.pid)
-        self._processes[job], self._of_slot[slot] = process, job
+        self._processes[job], self._jobs[slot] = process, job
         return job
-
-    def _is_busy(self, slot: int) -> bool:
-        return slot in self._of_slot and self.state(self._of_slot[slot]) == "running"
-
-
-class ForkedJob(Job):
-    """A job whose commands are forked from this process, and need not import anything again."""
-
-    poll_s = 0.05
-
-    def start(self, words: Sequence[str]) -> Child:
-        """See `Job.start`."""
-        arguments = (tuple(words), dict(self.work.environment), str(self.work.log))
-        process = multiprocessing.get_context("fork").Process(target=_command, args=arguments)
-        process.start()
-        assert process.pid is not None, "a started process has a number"
-        return Child(process.pid, process.join)
 
 
 def _execute(work: Work) -> None:
     """Execute a job in the process that was forked for it: the leader of a process group."""
     os.setsid()
     os.chdir(work.folder)
-    job = ForkedJob(work)
+    job = Job(work, _fork)
+    job.poll_s = POLL_S
 
     def stop(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -111,6 +96,15 @@ def _execute(work: Work) -> None:
 
     signal.signal(signal.SIGTERM, stop)
     sys.exit(max(0, job()))
+
+
+def _fork(work: Work, words: Sequence[str]) -> tuple[int, Callable[[], object]]:
+    """Fork a command from this process, so that it need not import anything again."""
+    arguments = (tuple(words), work.environment, str(work.log))
+    process = multiprocessing.get_context("fork").Process(target=_command, args=arguments)
+    process.start()
+    assert process.pid is not None, "a started process has a number"
+    return process.pid, process.join
 
 
 def _command(words: Sequence[str], variables: Mapping[str, str], log: str) -> None:
@@ -133,34 +127,41 @@ def _signal(process: BaseProcess, number: signal.Signals) -> None:
 
 
 def run_command(words: Sequence[str], log: Path) -> str:
-    """Run ``python -m <words>`` to its end; "" or the reason of its failure in one sentence."""
+    """Run ``python -m <words>`` to its end; return "" or why it failed, in one sentence."""
     begin = log.stat().st_size if log.exists() else 0
     executor = LocalExecutor()
-    work = Work(log.stem, (Step(tuple(words), log.parent),), {}, log, Path.cwd())
-    (job,) = executor.submit([work])
+    (job,) = executor.submit([Work(log.stem, {tuple(words): None}, {}, log, Path.cwd())])
     try:
-        while executor.state(job) == "running":
-            time.sleep(0.05)
+        _wait(executor, job)
     except BaseException:
         executor.cancel(job)
-        while executor.state(job) == "running":
-            time.sleep(0.05)
+        _wait(executor, job)
         raise
     return failure_reason(log, begin)
 
 
+def _wait(executor: LocalExecutor, job: str) -> None:
+    while executor.state(job) == "running":
+        time.sleep(POLL_S)
+
+
 def gpus_of(slot: GpuSlot) -> list[str]:
-    """The GPUs of one entry of `gpus`."""
-    return [str(slot)] if isinstance(slot, int) else list(map(str, slot))
+    """Return the numbers of the GPUs in one entry of `gpus`."""
+    numbers = (slot,) if isinstance(slot, int) else slot
+    return [str(number) for number in numbers]
 
 
 def check_gpus(gpus: Sequence[GpuSlot] | None) -> None:
     """Refuse GPUs that this machine does not have or hides: a run would train on the CPU."""
-    for number in (each for slot in gpus or () for each in gpus_of(slot)):
-        shown = os.environ.get(GPUS)
-        if shown is None:
-            import torch
+    needed = [number for slot in gpus or () for number in gpus_of(slot)]
+    if not needed:
+        return
+    shown = os.environ.get(GPUS)
+    if shown is None:
+        import torch
 
-            shown = ",".join(map(str, range(torch.cuda.device_count())))
-        if number not in [word.strip() for word in shown.split(",")]:
+        shown = ",".join(str(number) for number in range(torch.cuda.device_count()))
+    known = [word.strip() for word in shown.split(",")]
+    for number in needed:
+        if number not in known:
             raise InputError(f"gpus: no GPU {number}; this machine shows {shown or 'none'}.")

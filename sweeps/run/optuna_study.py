@@ -15,7 +15,6 @@ from rgbt.files.atomic import holding
 from rgbt.runs.provenance import without_passwords
 from rgbt.terminal import info
 from sweeps import attributes as names
-from sweeps.run.running_point import End
 from sweeps.settings import Objective
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ DATABASE = "optuna.db"
 
 
 def study_folder(runs_dir: Path, name: str) -> Path:
-    """Folder of a study: lock, database, report. Characters such as / in its name are replaced."""
+    """Return the folder of a study: lock, database, report; / etc. in its name are replaced."""
     safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:80]
     if safe != name:
         safe += "-" + hashlib.sha256(name.encode()).hexdigest()[:6]
@@ -37,7 +36,7 @@ def study_folder(runs_dir: Path, name: str) -> Path:
 
 @contextmanager
 def driving(runs_dir: Path, name: str) -> Iterator[bool]:
-    """Whether this process drives the study, and nobody else; if not, prints who does."""
+    """Take the study for this process; yields whether it is free, and prints who drives it."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"study={name}: only letters, digits, spaces and _ - . : / are possible.")
     folder = study_folder(runs_dir, name)
@@ -49,7 +48,7 @@ def driving(runs_dir: Path, name: str) -> Iterator[bool]:
 
 
 def storage_url(storage: str | None, runs_dir: Path, name: str) -> str:
-    """The address of a study's storage for SQLAlchemy: `storage`, or the file in its folder."""
+    """Return the address of a study's storage for SQLAlchemy: by default, a file in its folder."""
     return storage or f"sqlite:///{study_folder(runs_dir, name) / DATABASE}"
 
 
@@ -75,9 +74,8 @@ def open_study(
     storage: BaseStorage,
     objectives: Sequence[Objective],
     attributes: Mapping[str, Any],
-    **samplers: Any,
 ) -> optuna.Study:
-    """The study called `name`, created if it does not exist; with `sampler` and `pruner`.
+    """Open the study called `name`, and create it if it does not exist.
 
     InputError: there is one with other objectives or another space.
     """
@@ -85,7 +83,7 @@ def open_study(
 
     directions = [objective.direction for objective in objectives]
     study = optuna.create_study(
-        study_name=name, storage=storage, directions=directions, load_if_exists=True, **samplers
+        study_name=name, storage=storage, directions=directions, load_if_exists=True
     )
     metrics = [objective.metric for objective in objectives]
     wanted, known = {names.METRICS: metrics, **attributes}, study.user_attrs
@@ -101,7 +99,7 @@ def open_study(
 
 
 def known_studies(storage: str | None, runs_dir: Path) -> dict[str, optuna.Study]:
-    """The studies of a storage, or of a folder of runs, by name; nothing is created."""
+    """Return the studies of a storage, or of a folder of runs, by name; nothing is created."""
     import optuna
 
     files = sorted(runs_dir.glob(f"studies/*/{DATABASE}"))
@@ -111,14 +109,6 @@ def known_studies(storage: str | None, runs_dir: Path) -> dict[str, optuna.Study
         path = url.removeprefix("sqlite:///")
         if "://" in path or Path(path).exists():
             opened = open_storage(url)
-            known = [study.study_name for study in opened.get_all_studies()]
-            found |= {each: optuna.load_study(study_name=each, storage=opened) for each in known}
+            for name in optuna.get_all_study_names(opened):
+                found[name] = optuna.load_study(study_name=name, storage=opened)
     return found
-
-
-def values_of(end: End, objectives: Sequence[Objective]) -> list[float] | None:
-    """The value of every objective of a finished point; None of another one."""
-    if end.state != "finished":
-        return None
-    scores = end.scores()
-    return [scores[objective.metric] for objective in objectives]

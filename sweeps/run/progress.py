@@ -21,6 +21,7 @@ from rich.progress import (
 )
 
 from rgbt.checks import without_controls
+from sweeps.point import Outcome
 from sweeps.run.running_point import RunningPoint
 
 CONSOLE = Console(stderr=True)
@@ -30,7 +31,7 @@ ENDS = ("finished", "failed", "pruned")
 
 
 def bars() -> Progress:
-    """Bars of rich, shown in a terminal only."""
+    """Return bars of rich, shown in a terminal only."""
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(24),
@@ -44,7 +45,7 @@ def bars() -> Progress:
 
 
 class ProgressView:
-    """The progress of a driver; use as a context manager."""
+    """Shows the progress of a driver; use as a context manager."""
 
     def __init__(self, title: str) -> None:
         self._title, self._bars = title, bars()
@@ -57,11 +58,14 @@ class ProgressView:
     def __exit__(self, *error: object) -> None:
         self._bars.stop()
 
-    def ended(self, point: RunningPoint, how: str, reason: str) -> None:
-        """Show that a point ended: "finished", "failed" or "pruned", and why."""
-        text = f"{point.task.plan.point.label}  {duration(point.seconds)}{_score(point)}"
-        log = f"; see {point.log}" if how == "failed" else ""
-        self.say(how, f"{text}: {reason}{log}" if reason else text)
+    def ended(self, point: RunningPoint, outcome: Outcome) -> None:
+        """Show how a point ended, and why."""
+        text = f"{point.plan.point.label}  {duration(point.seconds)}{_score(point)}"
+        if outcome.reason:
+            text += f": {outcome.reason}"
+        if outcome.reason and outcome.state == "failed":
+            text += f"; see {point.log}"
+        self.say(outcome.state, text)
 
     def say(self, how: str, text: str) -> None:
         """Print a line; in a terminal, of what is not as it should be alone."""
@@ -95,8 +99,8 @@ class ProgressView:
 
 
 def _line(point: RunningPoint) -> str:
-    """A running point: label, steps, score, time left."""
-    label = without_controls(point.task.plan.point.label)
+    """Return the line of a running point: label, steps, score, time left."""
+    label = without_controls(point.plan.point.label)
     left = point.seconds_left
     ends = "" if math.isnan(left) else f"  {duration(left)} left"
     return f"{label}  step {point.step} of {point.steps}{_score(point)}{ends}"
@@ -107,7 +111,10 @@ def _score(point: RunningPoint) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as "50 s", "12 min", "3 h 20 min"."""
+    """Write seconds as "50 s", "12 min" or "3 h 20 min"."""
     minutes = round(seconds / 60)
-    longer = f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
-    return f"{seconds:.0f} s" if seconds < 90 else longer
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if minutes < 90:
+        return f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import ray
 from annotated_types import Interval
 
-from rgbt.checks import InputError, RunError, one_line
+from rgbt.checks import InputError, RunError, check_choice, one_line
 from rgbt.config.values import check_value
 from rgbt.terminal import info
 from sweeps.run.job import Job, Work
@@ -24,20 +24,20 @@ from sweeps.run.job import Job, Work
 KEEPER, NAMESPACE = "jobs", "rgbt"
 
 
-@dataclass(frozen=True)
-class RayOptions:
-    """Settings of ``conf/hydra/launcher/ray.yaml``, which explains them."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
-    address: str | None
-    num_gpus: Annotated[float, Interval(ge=0, le=64)] | None
-    num_cpus: Annotated[float, Interval(gt=0, le=1024)]
-    max_retries: Annotated[int, Interval(ge=-1, le=1000)]
+# Settings of ``conf/hydra/launcher/ray.yaml``, which explains them.
+OPTIONS: dict[str, Any] = {
+    "address": str | None,
+    "num_gpus": Annotated[float, Interval(ge=0, le=64)] | None,
+    "num_cpus": Annotated[float, Interval(gt=0, le=1024)],
+    "max_retries": Annotated[int, Interval(ge=-1, le=1000)],
+}
 
 
 class Keeper:
-    """The actor: submits tasks and knows their states; a job is named by the log of its point."""
+    """Submits tasks and knows their states, as an actor; a job is named by the log of its point.
+
+    Ray ends the tasks of a process with that process, so that a driver cannot own them itself.
+    """
 
     def __init__(self) -> None:
         self._tasks: dict[str, Any] = {}
@@ -45,7 +45,7 @@ class Keeper:
         self._ends: dict[str, str] = {}
 
     def submit(self, job: str, work: Work, resources: Mapping[str, Any], begin: int) -> int:
-        """Queue a job whose log has that size, unless it has been before; the size at that time."""
+        """Queue a job, unless it is; return the size of its log, `begin`, when it was queued."""
         if self.state(job) != "running":
             self._ends.pop(job, None)
             self._begins[job] = begin
@@ -72,20 +72,16 @@ class Keeper:
 
 
 class RayExecutor:
-    """Tasks of the Ray cluster at `address`, of one that runs here, or of a new one."""
+    """Executes jobs on the Ray cluster at `address`, on one that runs here, or on a new one."""
 
-    def __init__(self, options: Mapping[str, Any], slots: int) -> None:
-        given = {name: value for name, value in options.items() if name != "_target_"}
-        settings: RayOptions = check_value("hydra.launcher", given, RayOptions)
-        self.slots, self.is_lasting = slots, _connect(settings.address)
-        gpus = settings.num_gpus
-        if gpus is None:
-            gpus = 1.0 if ray.cluster_resources().get("GPU") else 0.0
-        self._resources = {
-            "num_gpus": gpus,
-            "num_cpus": settings.num_cpus,
-            "max_retries": settings.max_retries,
-        }
+    def __init__(self, options: Mapping[str, Any], workers: int | None) -> None:
+        for name, value in options.items():
+            check_choice("hydra.launcher", name, OPTIONS)
+            check_value(f"hydra.launcher.{name}", value, OPTIONS[name])
+        self.slots, self.is_lasting = workers or sys.maxsize, _connect(options["address"])
+        self._resources = {name: value for name, value in options.items() if name != "address"}
+        if options["num_gpus"] is None:
+            self._resources["num_gpus"] = 1.0 if ray.cluster_resources().get("GPU") else 0.0
         self._warn_if_too_large()
         # On the head node: with the loss of that one, the cluster ends anyway.
         head = {"num_cpus": 0, "resources": {"node:__internal_head__": 0.001}}
@@ -118,12 +114,14 @@ class RayExecutor:
     def _warn_if_too_large(self) -> None:
         wanted = {"GPU": self._resources["num_gpus"], "CPU": self._resources["num_cpus"]}
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(all(node.get(n, 0) >= size for n, size in wanted.items()) for node in nodes):
-            info(f"no node of the Ray cluster has {wanted}: runs wait until there is one.")
+        for node in nodes:
+            if all(node.get(name, 0) >= size for name, size in wanted.items()):
+                return
+        info(f"no node of the Ray cluster has {wanted}: runs wait until there is one.")
 
 
 def _connect(address: str | None) -> bool:
-    """Whether there is a cluster; if none runs, and none is named, Ray is started here."""
+    """Connect to Ray, and start it if none runs or is named; whether it continues without us."""
     answer = signal.getsignal(signal.SIGTERM)
     try:
         return _init(address)

@@ -18,8 +18,8 @@ from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tracker import Tracking
-from sweeps.evaluation import Words, stored_at
-from sweeps.run.planner import PlannedPoint
+from sweeps.plan.measurement import Words, stored_at
+from sweeps.plan.planner import PlannedPoint
 
 
 @dataclass
@@ -36,7 +36,7 @@ class RunStore:
     _is_unreachable: bool = field(default=False, init=False)
 
     def find(self, key: str, dataset: str, evaluations: Sequence[Words] = ()) -> RunResult | None:
-        """The finished run `key` on the data set with that fingerprint; None if there is none.
+        """Return the finished run `key` on the data set with that fingerprint; None: there is none.
 
         An archived run cannot be evaluated further: it counts if it has all `evaluations`.
         RunError: the run folder is finished, but on other files of the data set.
@@ -45,7 +45,7 @@ class RunStore:
         result = RunResult(folder) if is_finished(folder) else None
         if result is None and self.archive and (path := self.archive / f"{key}.zip").exists():
             archived = unpack(path)
-            is_whole = all(stored_at(archived, each) for each in evaluations)
+            is_whole = all(stored_at(archived, words) for words in evaluations)
             result = archived if is_whole and archived.fingerprint == dataset else None
         if result is None:
             return None
@@ -61,11 +61,15 @@ class RunStore:
         return None if self._is_outdated(result) else result
 
     def of_point(self, plan: PlannedPoint) -> tuple[RunResult, ...]:
-        """The runs of a point if all are finished, evaluated or not; () otherwise; see `find`."""
+        """Return the runs of a point if `find` has all of them, evaluated or not; else ()."""
         wanted = plan.point.evaluations
-        found = [self.find(run.key, plan.fingerprints[run.key], wanted) for run in plan.runs]
-        results = tuple(result for result in found if result is not None)
-        return results if len(results) == len(found) else ()
+        results = []
+        for run in plan.runs:
+            result = self.find(run.key, plan.fingerprints[run.key], wanted)
+            if result is None:
+                return ()
+            results.append(result)
+        return tuple(results)
 
     def replace_outdated(self, key: str) -> None:
         """Move a finished run that `find` ignores out of the way of a new training."""
@@ -98,7 +102,7 @@ class RunStore:
         self._with_mlflow(lambda tracking: tracking.store())
 
     def _with_mlflow(self, action: Callable[[MlflowTracking], Any]) -> None:
-        """`action` on MLflow; nothing without it, and from its first failure on (one warning)."""
+        """Do `action` on MLflow; nothing without it, or after a failure, which is one warning."""
         if self._is_unreachable or not isinstance(self.tracking, MlflowTracking):
             return
         try:
@@ -110,6 +114,6 @@ class RunStore:
 
 
 def open_run_store(config: DictConfig) -> RunStore:
-    """Finished runs in the folder of runs and in the tracker of a composed configuration."""
+    """Open the finished runs in the folder of runs and the tracker of a composed configuration."""
     runs_dir = Path(config.runs_dir).expanduser().resolve()
     return RunStore(runs_dir, build(config.tracking), fresh=config.fresh)

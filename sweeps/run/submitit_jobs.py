@@ -25,7 +25,8 @@ from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import read_json, write_json
 from sweeps.run.job import Job, Work
 
-# Folder in the folder of runs: the job of each point, and files that stop them.
+# Folder in the folder of runs: the job of each point, and files that stop them. submitit itself
+# finds jobs again by their number alone, asks sacct, which not every cluster has, and only kills.
 JOBS = ".jobs"
 # Most jobs of an array that SLURM accepts by default.
 MOST_JOBS = 1000
@@ -47,7 +48,7 @@ RUNNING = ("RUNNING", "COMPLETING", "SUSPENDED", "STOPPED", "SIGNALING", "STAGE_
 
 
 class SubmititJob(Job):
-    """A job that a file stops, and that is queued again near its time limit."""
+    """Executes a job until a file stops it, and is queued again near its time limit."""
 
     def __call__(self) -> int:
         """See `Job`."""
@@ -61,13 +62,13 @@ class SubmititJob(Job):
         self.is_stopped = self.is_stopped or stop_file(self.work).exists()
 
     def checkpoint(self) -> DelayedSubmission:
-        """What is queued again, when the step is saved; submitit calls it for a signal."""
+        """Save the step, and return what is queued again; submitit calls it for a signal."""
         self.stop()
         return DelayedSubmission(SubmititJob(self.work))
 
 
 class SubmititExecutor:
-    """Jobs of a cluster ("slurm"), or of this machine ("local")."""
+    """Executes jobs on a cluster ("slurm"), or on this machine ("local")."""
 
     def __init__(self, cluster: str, options: Mapping[str, Any], workers: int | None) -> None:
         self._cluster, self._executor = cluster, _executor(cluster, options)
@@ -126,7 +127,7 @@ class SubmititExecutor:
             self._asked_at = float("-inf")
 
     def _queued_before(self, work: Work) -> str:
-        """The job of a point that an earlier driver has submitted and that has not ended; or ""."""
+        """Return the job of a point that an earlier driver has submitted and that has not ended."""
         # A job that was told to stop may still save its step; the next one waits for its run.
         if self._cluster != "slurm" or not record(work).is_file() or stop_file(work).exists():
             return ""
@@ -136,20 +137,20 @@ class SubmititExecutor:
 
 
 def record(work: Work) -> Path:
-    """The file that names the job of a point."""
+    """Return the file that names the job of a point."""
     return work.log.parent.parent / JOBS / f"{work.key}.json"
 
 
 def stop_file(work: Work) -> Path:
-    """The file whose existence stops the job of a point."""
+    """Return the file whose existence stops the job of a point."""
     return record(work).with_suffix(".stop")
 
 
 def states_of_slurm() -> dict[str, str]:
-    """The jobs of this user and their states; SLURM forgets one some minutes after its end."""
+    """Return the states of this user's jobs; SLURM forgets one some minutes after its end."""
     command = ("squeue", "--noheader", "--array", "--states=all", "--format=%i|%T")
     # Filters of the user (SQUEUE_PARTITION) would hide jobs; nor need USER be who submits.
-    environment = {name: each for name, each in os.environ.items() if name[:7] != "SQUEUE_"}
+    environment = {name: value for name, value in os.environ.items() if name[:7] != "SQUEUE_"}
     text = subprocess.run(
         [*command, f"--user={os.getuid()}"],
         check=True,
@@ -158,8 +159,12 @@ def states_of_slurm() -> dict[str, str]:
         timeout=60,
         env=environment,
     ).stdout
-    found = dict(line.strip().split("|") for line in text.splitlines() if "|" in line)
-    return {job: _word(state) for job, state in found.items()}
+    states = {}
+    for line in text.splitlines():
+        if "|" in line:
+            job, state = line.strip().split("|")
+            states[job] = _word(state)
+    return states
 
 
 def _word(state: str) -> str:
@@ -171,7 +176,7 @@ def _word(state: str) -> str:
 
 
 def _executor(cluster: str, options: Mapping[str, Any]) -> submitit.AutoExecutor:
-    given = {name: value for name, value in options.items() if name != "_target_"}
+    given = dict(options)
     for name in ("nodes", "tasks_per_node"):
         if given.get(name, 1) != 1:
             raise InputError(
@@ -180,11 +185,12 @@ def _executor(cluster: str, options: Mapping[str, Any]) -> submitit.AutoExecutor
             )
     folder, timeouts = given.pop("submitit_folder"), given.pop("max_num_timeout", None)
     limits = {} if timeouts is None else {f"{cluster}_max_num_timeout": timeouts}
+    parameters = {
+        name if name in SHARED else f"{cluster}_{name}": value for name, value in given.items()
+    }
     try:
         executor = submitit.AutoExecutor(folder, cluster=cluster, **limits)
-        executor.update_parameters(
-            **{key if key in SHARED else f"{cluster}_{key}": value for key, value in given.items()}
-        )
+        executor.update_parameters(**parameters)
     except (RuntimeError, ValueError, TypeError, NameError, AssertionError) as error:
         raise InputError(f"hydra/launcher=submitit_{cluster}: {one_line(error)}") from error
     return executor

@@ -29,7 +29,7 @@ run("analysis.compare", *counts, *fast)
 run("analysis.score", f"counts={{counts[0][2:]}}", "resamples=0")
 run("analysis.archive", "check", "archive=none")
 run("analysis.figures.__main__", "figure=multihead/fig3", "out=curves.svg")
-run("sweeps.report.__main__", "runs_dir=none", "archive=none", "out=report")
+run("sweeps.report", "runs_dir=none", "archive=none", "out=report")
 print("torch" in sys.modules)
 """
 

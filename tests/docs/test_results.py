@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sweeps.report.__main__ import report_of
+from sweeps.show.pages import Report
 
 pytestmark = pytest.mark.docs
 
@@ -20,7 +20,7 @@ def test_pages_figures_and_marked_numbers_follow_from_the_archive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(ROOT)
-    report = report_of(Path("none"), Path("results"), 2000, counted=True)
+    report = Report(Path("none"), Path("results"), 2000, counted=True)
     made = {RESULTS / name: text for name, text in report.pages().items()}
     marked = re.search(r"^MARKED := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert marked is not None

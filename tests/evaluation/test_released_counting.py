@@ -19,7 +19,7 @@ from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.measure import measure, measurement_of
 from rgbt.evaluation.predictor import Predictor
 from rgbt.types import Batch, Output
-from sweeps.table.table import load_table
+from sweeps.plan.table import load_table
 from tests.composed import specified
 from tests.evaluation.test_details import session_of
 

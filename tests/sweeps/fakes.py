@@ -22,31 +22,36 @@ from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.evaluation import Words, measurement_of
+from sweeps.plan.measurement import Words, measurement_of
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run import driver as drivers
 from sweeps.run import point_list
-from sweeps.run.job import SAYS, STARTED, TRAINING, Work, how_ended
+from sweeps.run.job import SAYS, STARTED, Work, how_ended
 from sweeps.run.optuna_study import open_study
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
 from sweeps.run.running_point import RunningPoint
 from sweeps.run.search_source import SearchSource
-from sweeps.settings import Launcher, Objective, SweepSettings, read_settings
-from sweeps.space import build_sampler, parse_space
+from sweeps.settings import Objective, SweepSettings, read_settings
+from sweeps.space import parse_space
 from tests.measured import measurement
 
 DATASET = "fingerprint-of-the-data"
 
 
+def hydra_node(sweeper: Any, launcher: str = "basic", **options: Any) -> DictConfig:
+    """The node ``hydra`` as far as a sweep reads it."""
+    choices = {"choices": {"hydra/launcher": launcher}}
+    return OmegaConf.create({"sweeper": sweeper, "launcher": options, "runtime": choices})
+
+
 def settings(**changes: Any) -> SweepSettings:
     """Settings of a sweep, as in study.yaml but for `changes` and the first two."""
     file = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
-    assert isinstance(file, DictConfig)
     objectives = (Objective("test/mIoU", "maximize"),)
     sampler = {"_target_": "optuna.samplers.RandomSampler", "seed": 0}
-    plain = read_settings(file, Launcher())
+    plain = read_settings(hydra_node(file))
     return replace(plain, **{"objectives": objectives, "sampler": sampler, **changes})
 
 
@@ -129,12 +134,17 @@ def finish(
 
 @dataclass(frozen=True)
 class Call:
-    """A command of a job, and the folder of its run."""
+    """A command of a job, and the folder of the run that it trains."""
 
     module: str
     words: tuple[str, ...]
-    folder: Path
+    trained: Path | None
     log: Path
+
+    @property
+    def folder(self) -> Path:
+        assert self.trained is not None, "it trains nothing"
+        return self.trained
 
     def value(self, name: str) -> str:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
@@ -215,10 +225,9 @@ class FakeJob:
     def _execute(self) -> Generator[None, None, None]:
         self._say(f"{STARTED} on fake")
         code = 0
-        for step in self.work.steps:
-            module, *words = step.words
-            if module != TRAINING or not is_finished(step.folder):
-                call = Call(module, tuple(words), step.folder, self.work.log)
+        for (module, *words), trained in self.work.steps.items():
+            if trained is None or not is_finished(trained):
+                call = Call(module, tuple(words), trained, self.work.log)
                 self._executor.calls.append(call)
                 code = yield from self._executor.behaviour(call)
             if code:
@@ -293,8 +302,8 @@ class FakeView:
 
     def __exit__(self, *error: object) -> None: ...
 
-    def ended(self, point: RunningPoint, how: str, reason: str) -> None:
-        self.ends.append((point.task.plan.point.label, how, reason))
+    def ended(self, point: RunningPoint, outcome: Outcome) -> None:
+        self.ends.append((point.plan.point.label, outcome.state, outcome.reason))
 
     def say(self, how: str, text: str) -> None:
         self.said.append((how, text))
@@ -338,8 +347,10 @@ class Desk:
         planner: Any = None,
         **changes: Any,
     ) -> None:
-        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
         self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
+        launcher = "submitit_slurm" if self.executor.is_lasting else "basic"
+        self.settings = settings(**{"launcher": launcher, **changes})
+        self.runs = RunStore(runs_dir, NoTracking())
         self.planner: Any = planner or FakePlanner()
 
 
@@ -370,7 +381,7 @@ class ListDesk(Desk):
         return self
 
     def states(self) -> list[str]:
-        return [each.state for each in self.outcomes or ()]
+        return [outcome.state for outcome in self.outcomes or ()]
 
 
 class SearchDesk(Desk):
@@ -388,16 +399,21 @@ class SearchDesk(Desk):
     ) -> None:
         super().__init__(runs_dir, behaviour, pruner=pruner and {"_target_": "given"}, **others)
         self.storage = storage or optuna.storages.InMemoryStorage()
-        both = {"sampler": build_sampler(self.settings.sampler), "pruner": pruner}
-        self.study = open_study("study", self.storage, self.settings.objectives, {}, **both)
+        self.study = open_study("study", self.storage, self.settings.objectives, {})
+        self.study.pruner = pruner or optuna.pruners.NopPruner()
         searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
-        given = ((), searched, self.study, self.settings, self.view.say)
+        given = ((), searched, self.study, self.settings, self.runs, self.view.say)
         self.source = SearchSource(*given, self.planner)
 
     def run(self) -> SearchDesk:
         with driven_by(self.executor, self.view):
             drivers.drive(self.view, self.source, self.runs, self.settings)  # type: ignore[arg-type]
         return self
+
+    def next(self) -> PlannedPoint:
+        plan = self.source.next()
+        assert plan is not None
+        return plan
 
     @property
     def trials(self) -> list[Any]:

@@ -12,10 +12,10 @@ import numpy as np
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.runs.result import OWN
-from sweeps.evaluation import Words, measurement_of
+from sweeps.plan.measurement import Words, measurement_of
+from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import CellId, ScoredTable, score
-from sweeps.table.table import Column, Row, Table
+from sweeps.score.cells import CellId, ScoredTable, score
 from tests.measured import measurement
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]

@@ -10,12 +10,12 @@ import pytest
 
 from rgbt.files.plain_files import write_json
 from sweeps.claims import entry as claims
+from sweeps.plan.planner import Planner
+from sweeps.plan.request import UNTIL_DECIDED
 from sweeps.reproduce import entry as reproduce
-from sweeps.run.planner import Planner
-from sweeps.table.request import UNTIL_DECIDED
 from tests.commands import Call, assert_one_sentence
 from tests.measured import remeasured
-from tests.sweeps.verdicts.accuracies import accuracy
+from tests.sweeps.judge.accuracies import accuracy
 
 TABLE = """\
 paper: my

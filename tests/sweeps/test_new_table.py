@@ -6,8 +6,8 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.new_table import write_new
+from sweeps.plan.table import load_table
 from sweeps.reproduce import entry
-from sweeps.table.table import load_table
 from tests.commands import Call, assert_one_sentence
 
 

@@ -13,11 +13,10 @@ import pytest
 
 from analysis.archive import archived
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps import queue as queues
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Point
-from sweeps.reproduce import Options, settings_of
+from sweeps.reproduce import Options, reproduce_several, settings_of
 from sweeps.run import driver as drivers
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
     Behaviour,
@@ -66,7 +65,7 @@ class QuickPlanner(FakePlanner):
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(queues, "study_names", list)
+    monkeypatch.setattr("sweeps.plan.table.study_names", list)
     # The scores of fake runs are not those of their counts.
     monkeypatch.setattr("rgbt.runs.result.RunResult.check", lambda _: None)
     write_table("one", ("crm", "baseline"), [("crm", "baseline")])
@@ -85,7 +84,7 @@ def run(
     chosen = Options(table=table, runs_dir=place / "runs", **options)
     runs, planner = RunStore(place / "runs", NoTracking()), QuickPlanner()
     with driven_by(executor := FakeExecutor(behaviour), FakeView()):
-        code = queues.run_queue(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
+        code = reproduce_several(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
     return code, [words[0].removeprefix("+experiment=") for words in executor.started()]
 
 

@@ -52,7 +52,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
         def work(wanted: PointList, settings: SweepSettings) -> Sequence[Outcome]:
             asked.append((wanted, settings))
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
-            return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
+            return [_outcome(*known) for known in zip(wanted.points, turns, range(99))]
 
         monkeypatch.setattr(point_list, "run_points", work)
         monkeypatch.setattr(point_list, "preview_points", work)
@@ -124,7 +124,7 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
         ("table=my/small workers=0", "workers'"),
         ("table=my/small +experiment=crm", "experiment"),
         ("table=my/small camera@consistency.view.camera=synth", "rgbt consistency"),
-        ("table=my/small hydra/launcher=joblib", "hydra.sweeper.workers"),
+        ("table=my/small hydra/launcher=joblib", "its n_jobs is workers)"),
         ("table=my/small hydra.launcher.partition=gpu", "partition"),
         ("", "'table'"),
     ],
@@ -154,7 +154,7 @@ def test_options_of_execution_are_sweep_settings() -> None:
     words = ("hydra/launcher=ray", "hydra.launcher.num_gpus=0.25")
     found = settings_of(Options("my/small", **changes), words)
     assert vars(found).items() >= {**changes, "commands": "file"}.items()
-    assert (found.launcher.name, found.launcher.options["num_gpus"]) == ("ray", 0.25)
+    assert (found.launcher, found.launcher_options["num_gpus"]) == ("ray", 0.25)
 
 
 @pytest.mark.parametrize("word", ["hydra.sweeper.workers=2", "+hydra.launcher.key=1"])

@@ -16,7 +16,7 @@ from optuna.trial import TrialState, create_trial
 from rgbt.tables import TextTable
 from sweeps import attributes, study
 from sweeps.run.optuna_study import driving, storage_url, study_folder
-from sweeps.study import StudyData, entry, importances
+from sweeps.study import entry, importances, trials_frame
 from tests.commands import Call, assert_one_sentence
 
 ALPHA = FloatDistribution(0, 1)
@@ -56,7 +56,7 @@ def add(
 
 
 def grid_of(made: optuna.Study) -> TextTable:
-    return study.trials_grid(StudyData.read(made))
+    return study.trials_grid(made, trials_frame(made))
 
 
 def test_trials_grid_sorts_by_objective_direction() -> None:
@@ -96,7 +96,7 @@ def test_tables_count_the_states_and_list_failures() -> None:
     add(made, [51.0], runs=["k1"])
     add(made, state="RUNNING")
     add(made, state="FAIL", label="x", reason="by\nsignal | 9", runs=["r1", "r2"])
-    counts, best, failed = study.tables(StudyData.read(made))
+    counts, best, failed = study.tables(made, trials_frame(made))
     assert counts.rows == (("3", "1", "0", "1", "1", "0"),)
     assert [row[0] for row in best.rows] == ["0"]
     assert failed.rows == (("by signal | 9", "2", "x", "r1 r2"),)
@@ -122,7 +122,7 @@ def test_importances_name_the_deciding_parameter() -> None:
         big, small = index / 40, (index * 7 % 40) / 40
         params = {"small": small, "big": big, "same": 0.5}
         add(made, [10 * big + 0.01 * small, 5 * small + 0.001 * big], params=params)
-    grid, _ = importances(StudyData.read(made))
+    grid, _ = importances(made, trials_frame(made))
     assert grid is not None
     (first, *of_big), (second, *of_small) = grid.rows
     assert (first, second) == ("big", "small")
@@ -138,7 +138,7 @@ def test_importances_missing_have_a_reason() -> None:
         add(fixed, [float(index)], params={"x": 0.5})
     for index in range(9):
         add(few, [float(index)], params={"x": index / 20})
-    found = [importances(StudyData.read(each)) for each in (few, fixed)]
+    found = [importances(made, trials_frame(made)) for made in (few, fixed)]
     assert found[0] == (None, "they need 10 complete trials, and there are 9.")
     assert found[1] == (None, "no parameter, or no objective, took two values.")
 

@@ -13,6 +13,7 @@ import hydra
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import open_dict
+from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 
 import sweeps.sweep as sweeping
@@ -21,11 +22,11 @@ from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.run import executors, point_list
+from sweeps.run import point_list
 from sweeps.run.optuna_study import driving, known_studies
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import open_run_store
-from sweeps.settings import Launcher, Objective, SweepSettings
+from sweeps.settings import Objective, SweepSettings
 from sweeps.space import parse_space
 from sweeps.sweep import Search, probe, search, sweep
 from tests.commands import SPLITS, short, words_of
@@ -162,14 +163,6 @@ def test_a_grid_that_another_process_drives_ends_quietly(
     assert not said.out
 
 
-def test_a_launcher_without_its_package_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(executors, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match="hydra/launcher=ray: it needs pip install"):
-        call(tmp_path, *GRID, "hydra/launcher=ray")
-
-
 def sigma(low: float, high: float) -> Any:
     return parse_space({"masker.sigma_div": {"type": "float", "low": low, "high": high}})
 
@@ -189,9 +182,9 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     states: list[str] = ["COMPLETE"]
 
     def drive(view: Any, source: Any, *rest: Any) -> None:
-        study = source._study
+        study = source.study
         for state in states:
-            trial = study.ask(dict(source._space))
+            trial = study.ask(dict(source.space))
             trial.set_user_attr(names.REASON, "no memory")
             study.tell(trial, 1.0 if state == "COMPLETE" else None, TrialState[state])
 
@@ -244,7 +237,7 @@ TC, UP = (Objective(metric, "maximize") for metric in ("val/TC/aligned", "val/mI
         ({"objectives": (UP, UP), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
         ({"objectives": (TC,)}, "val/TC/aligned'.*consistency.splits"),
         ({"commands": "file"}, "hydra.sweeper.commands is for grids"),
-        *(({"launcher": Launcher(name)}, f"{name} needs hydra.sweeper.workers") for name in FAR),
+        *(({"launcher": name}, f"{name} needs hydra.sweeper.workers") for name in FAR),
     ],
 )
 def test_search_invalid_settings_raise_before_study_exists(
@@ -272,6 +265,17 @@ def test_a_search_that_another_process_drives_ends_quietly(
     for name in ("s", "t"):
         search(replace(wanted, study=name), settings(storage=url))
     assert sorted(known_studies(url, tmp_path)) == ["s", "t"]
+
+
+def test_a_storage_that_is_away_ends_the_command(
+    wanted: Search, ends: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drive(*_: Any) -> None:
+        raise StorageInternalError("no route to host\nmore")
+
+    monkeypatch.setattr(sweeping, "drive", drive)
+    with pytest.raises(RunError, match="storage: no route to host; rerun the command"):
+        search(wanted, settings())
 
 
 def test_search_without_finished_trial_raises(wanted: Search, ends: list[str]) -> None:

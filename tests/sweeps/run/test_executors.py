@@ -1,4 +1,4 @@
-"""The launchers that a sweep works with, and what is said of the others."""
+"""Executors of launchers, and what is said of a launcher that is not installed."""
 
 from __future__ import annotations
 
@@ -10,27 +10,9 @@ from hydra.errors import MissingConfigException
 
 from rgbt.checks import InputError
 from rgbt.config.command import hydra_sentence
-from sweeps.run import executors
-from sweeps.run.executors import check_launcher, open_executor
+from sweeps.run.executors import open_executor
 from sweeps.run.local import LocalExecutor
-from sweeps.settings import Launcher
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("joblib", r"works with .*, ray \(its n_jobs is hydra\.sweeper\.workers\)\.$"),
-        ("rq", r"=rq: a sweep works with basic, submitit_local, submitit_slurm, ray\.$"),
-        ("ray", r"ray: it needs pip install 'rgbt\[ray\]'"),
-    ],
-)
-def test_other_and_missing_launchers_are_refused(
-    monkeypatch: pytest.MonkeyPatch, name: str, said: str
-) -> None:
-    monkeypatch.setattr(executors, "find_spec", lambda _: None)
-    check_launcher(Launcher())
-    with pytest.raises(InputError, match=said):
-        check_launcher(Launcher(name))
+from tests.sweeps.fakes import settings
 
 
 def test_a_launcher_that_is_not_installed_names_the_extra() -> None:
@@ -42,9 +24,15 @@ def test_a_launcher_that_is_not_installed_names_the_extra() -> None:
 
 def test_gpus_are_chosen_for_jobs_of_this_machine_alone() -> None:
     with pytest.raises(InputError, match=r"gpus=\[0\]: hydra/launcher=ray chooses"):
-        open_executor(Launcher("ray"), None, [0])
-    found = [open_executor(Launcher(), workers, None) for workers in (None, 3)]
-    assert [(type(each), each.slots) for each in found] == [(LocalExecutor, 1), (LocalExecutor, 3)]
+        open_executor(settings(launcher="ray", gpus=(0,)))
+
+
+def test_jobs_of_this_machine_are_waited_for() -> None:
+    found = [open_executor(settings(workers=workers)) for workers in (None, 3)]
+    assert [type(executor) for executor in found] == [LocalExecutor, LocalExecutor]
+    assert [executor.slots for executor in found] == [1, 3]
+    with pytest.raises(InputError, match=r"wait=false: .*SLURM"):
+        open_executor(settings(wait=False))
 
 
 def test_jobs_of_slurm_are_found_with_any_variables_of_the_user(

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.files.atomic import holding
 from sweeps.run import job as jobs
-from sweeps.run.job import Child, Job, Step, Work, failed_before, failure_reason, how_ended
+from sweeps.run.job import Job, Work, failed_before, failure_reason, how_ended, start_python
 from tests.waiting import is_alive, until
 
 STEPS = "tests.sweeps.steps"
@@ -25,7 +25,7 @@ STEPS = "tests.sweeps.steps"
 
 def work_of(folder: Path, *steps: str, **environment: str) -> Work:
     """A point whose steps are these lines of words for `tests.sweeps.steps`."""
-    made = tuple(Step((STEPS, *line.split()), folder) for line in steps)
+    made = dict.fromkeys((STEPS, *line.split()) for line in steps)
     return Work("key", made, environment, folder / ".logs" / "key.log", folder)
 
 
@@ -90,26 +90,30 @@ def in_thread(job: Job, ends: list[int]) -> threading.Thread:
 
 def training(folder: Path, name: str) -> Work:
     (folder / name).mkdir(exist_ok=True)
-    step = Step((STEPS, "train", str(folder / name / "own")), folder / name)
-    return Work(name, (step,), {}, folder / f"{name}.log", folder)
+    words = (STEPS, "train", str(folder / name / "own"))
+    return Work(name, {words: folder / name}, {}, folder / f"{name}.log", folder)
 
 
 @pytest.fixture
-def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Work:
+def trained(tmp_path: Path) -> Work:
     """A point whose training is that of `tests.sweeps.steps`."""
-    monkeypatch.setattr(jobs, "TRAINING", STEPS)
     return training(tmp_path, "a")
+
+
+def run_folder(work: Work) -> Path:
+    (folder,) = work.steps.values()
+    assert folder is not None, "it is a training"
+    return folder
 
 
 def test_stopped_command_saves_and_ends(trained: Work) -> None:
     job, ends = Job(trained), list[int]()
     thread = in_thread(job, ends)
-    begun = trained.steps[0].folder / "steps"
+    begun = run_folder(trained) / "steps"
     until(begun.exists, "the command")
     job.is_stopped = True
     thread.join()
     assert ends == [143]
-    assert Job(trained).work.steps == trained.steps
     stopped = Job(trained)
     stopped.is_stopped = True
     assert stopped() == 143
@@ -118,7 +122,7 @@ def test_stopped_command_saves_and_ends(trained: Work) -> None:
 
 def test_two_jobs_of_a_run_train_it_once(trained: Work) -> None:
     """The second one waits for the lock, as for a command of the user."""
-    ends, folder = list[int](), trained.steps[0].folder
+    ends, folder = list[int](), run_folder(trained)
     threads = [in_thread(Job(trained), ends)]
     until((folder / "steps").exists, "the command")
     threads.append(in_thread(Job(trained), ends))
@@ -131,7 +135,7 @@ def test_two_jobs_of_a_run_train_it_once(trained: Work) -> None:
 
 
 def test_run_that_its_holder_leaves_is_continued(trained: Work) -> None:
-    ends, folder = list[int](), trained.steps[0].folder
+    ends, folder = list[int](), run_folder(trained)
     (folder / "own.go").touch()
     with holding(folder / "lock") as holder:
         assert holder is None
@@ -143,18 +147,14 @@ def test_run_that_its_holder_leaves_is_continued(trained: Work) -> None:
     assert (ends, (folder / "result.json").exists()) == ([0], True)
 
 
-def test_handler_may_come_when_a_command_has_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_handler_may_come_when_a_command_has_ended(tmp_path: Path) -> None:
     """That of submitit waits for the command at any instant, the one of its end included."""
-    job = Job(work_of(tmp_path, "leave x 0"))
-    start = job.start
 
-    def ending(words: Sequence[str]) -> Child:
-        child = start(words)
-        return Child(child.pid, lambda: (child.reap(), job.stop()))
+    def ending(work: Work, words: Sequence[str]) -> tuple[int, Callable[[], object]]:
+        pid, reap = start_python(work, words)
+        return pid, lambda: (reap(), job.stop())
 
-    monkeypatch.setattr(job, "start", ending)
+    job = Job(work_of(tmp_path, "leave x 0"), ending)
     assert job() == 0
 
 

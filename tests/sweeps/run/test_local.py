@@ -18,7 +18,7 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.run import local
-from sweeps.run.job import LOST, Step, Work, failure_reason
+from sweeps.run.job import LOST, Work, failure_reason
 from sweeps.run.local import LocalExecutor, check_gpus, run_command
 from tests.waiting import DEADLINE_S, is_alive, until
 
@@ -40,8 +40,7 @@ class Executor(LocalExecutor):
     """Starts points of one step; the names of jobs."""
 
     def start(self, folder: Path, words: str, name: str = "log", **environment: str) -> str:
-        step = Step((STEPS, *words.split()), folder)
-        work = Work("key", (step,), environment, folder / name, folder)
+        work = Work("key", {(STEPS, *words.split()): None}, environment, folder / name, folder)
         (job,) = self.submit([work])
         return job
 

@@ -13,23 +13,23 @@ from typing import Any
 
 import pytest
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, RunError
 from rgbt.files.atomic import holding
 from rgbt.files.plain_files import write_json
 from rgbt.runs.naming import TAGS, VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
+from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run.optuna_study import study_folder
-from sweeps.run.planner import PlannedPoint
 from sweeps.run.point_list import (
     commands_line,
     estimated_seconds,
-    finished_runs,
     other_code_line,
     preview_points,
 )
+from sweeps.run.point_state import evaluated_runs
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
     FakePlanner,
@@ -49,7 +49,7 @@ def named(*words: str, **more: Any) -> list[Point]:
 
 
 def previewed(desk: ListDesk) -> list[str]:
-    return [each.state for each in preview_points(desk.points, desk.settings)]
+    return [outcome.state for outcome in preview_points(desk.points, desk.settings)]
 
 
 def test_a_wrong_point_of_a_strict_list_starts_nothing(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
     rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
     desk = ListDesk(tmp_path, rows, planner=SameRun()).run()
     tags = {"table": "1 | 1.0", VARIED: "x"}
-    assert [each.point.tags for each in desk.outcomes or ()] == [tags, tags]
+    assert [outcome.point.tags for outcome in desk.outcomes or ()] == [tags, tags]
     assert (desk.states(), len(desk.executor.calls)) == (["finished"] * 2, 1)
     assert desk.view.counts[-1]["finished"] == 1
 
@@ -157,22 +157,21 @@ def test_a_preview_shows_runs_that_somebody_trains(tmp_path: Path) -> None:
         assert previewed(desk) == ["running", "waiting"]
 
 
-def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
+def test_a_point_is_finished_with_all_runs_and_evaluations(tmp_path: Path) -> None:
     ring, rgb = ("regions=ring9",), ("modality=rgb",)
     plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring, rgb)))
     runs = RunStore(tmp_path, NoTracking())
     for run in plan.runs:
-        assert finished_runs(plan, runs) == ()
+        assert evaluated_runs(plan, runs) == ()
         finish(tmp_path / run.key)
-    both = finished_runs(plan, runs)
-    assert [found.key for found in both] == [run.key for run in plan.runs]
-    for found in both:
+    for run in plan.runs:
         for words in (ring, rgb):
-            assert not plan.is_evaluated(both)
-            measure(found.folder, words)
-    assert plan.is_evaluated(both)
+            assert evaluated_runs(plan, runs) == ()
+            measure(tmp_path / run.key, words)
+    assert [found.key for found in evaluated_runs(plan, runs)] == [run.key for run in plan.runs]
     finish(tmp_path / plan.runs[0].key, dataset="another")
-    assert finished_runs(plan, runs) == ()
+    with pytest.raises(RunError, match="other files"):
+        evaluated_runs(plan, runs)
 
 
 def growing(last: int) -> Callable[[Sequence[Outcome]], list[Point]]:
@@ -188,7 +187,8 @@ def growing(last: int) -> Callable[[Sequence[Outcome]], list[Point]]:
 
 def test_a_resumed_list_continues_behind_the_added_points(tmp_path: Path) -> None:
     desk = ListDesk(tmp_path, 1, more=growing(2)).run()
-    assert [each.point.label for each in desk.outcomes or ()] == [f"x={x}" for x in range(3)]
+    labels = [outcome.point.label for outcome in desk.outcomes or ()]
+    assert labels == [f"x={x}" for x in range(3)]
     again = ListDesk(tmp_path, 1, more=growing(4)).run()
     assert again.states() == ["finished"] * 5
     assert again.executor.started() == [("x=3",), ("x=4",)]

@@ -11,19 +11,20 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.run import progress
 from sweeps.run.progress import ProgressView, duration
 
 Make = Callable[[bool], io.StringIO]
 LABEL = "files=[/data/a] [red]not a colour[/red]"
-PLAN = SimpleNamespace(point=Point(LABEL, ()))
 RUNNING: Any = SimpleNamespace(
-    task=SimpleNamespace(plan=PLAN),
+    plan=SimpleNamespace(point=Point(LABEL, ())),
     log="runs/.logs/k.log",
     is_started=True,
     **{"score": 0.4567, "step": 50, "steps": 100, "seconds": 100.0, "seconds_left": 1500.0},
 )
+FINISHED = Outcome(RUNNING.plan.point, "finished")
+FAILED = Outcome(RUNNING.plan.point, "failed", "a bad day")
 QUEUED: Any = SimpleNamespace(**{**vars(RUNNING), "is_started": False, "step": 0})
 COUNTS = Counter(finished=1, failed=1, running=2, waiting=4)
 LINE = f"  {LABEL}  step 50 of 100  val mIoU 45.67  25 min left"
@@ -52,8 +53,8 @@ def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
         for now in (0.5, 1.1, 1.5):
             minutes[0] = now
             view.update([RUNNING, QUEUED], COUNTS)
-        view.ended(RUNNING, "finished", "")
-        view.ended(RUNNING, "failed", "a bad day")
+        view.ended(RUNNING, FINISHED)
+        view.ended(RUNNING, FAILED)
     assert [line[9:].rstrip() for line in text.getvalue().splitlines()] == [
         f"started  {LABEL}",
         "state    table: 1 finished, 1 failed, 1 running, 4 waiting, 1 queued",
@@ -69,8 +70,8 @@ def test_a_terminal_has_bars_and_lines_of_failures(console: Make) -> None:
     with view:
         for word in ("queued", "started"):
             view.say(word, LABEL)
-        view.ended(RUNNING, "finished", "")
-        view.ended(RUNNING, "failed", "a bad day")
+        view.ended(RUNNING, FINISHED)
+        view.ended(RUNNING, FAILED)
         view.update([RUNNING, QUEUED], COUNTS)
         probe = Console(file=io.StringIO(), width=160)
         probe.print(view._bars.get_renderable())

@@ -56,7 +56,7 @@ def test_ray_of_its_own(straight: Sweep, tmp_path: Path, monkeypatch: pytest.Mon
 SHARED = """
 import json, sys, time
 from pathlib import Path
-from sweeps.run.job import Step, Work
+from sweeps.run.job import Work
 from sweeps.run.ray_tasks import RayExecutor
 
 folder, address = Path(sys.argv[1]), sys.argv[2]
@@ -64,8 +64,8 @@ options = {"address": address, "num_gpus": 0.5, "num_cpus": 0.5, "max_retries": 
 executor = RayExecutor(options, 5)
 works = []
 for key in "abcde":
-    step = Step(("tests.sweeps.steps", "wait", str(folder / key)), folder)
-    works.append(Work(key, (step,), {}, folder / f"{key}.log", folder))
+    steps = {("tests.sweeps.steps", "wait", str(folder / key)): None}
+    works.append(Work(key, steps, {}, folder / f"{key}.log", folder))
 names = executor.submit(works)
 assert executor.submit(works) == names, "twice"
 def states():
@@ -96,10 +96,10 @@ def test_runs_share_gpus(cluster: Any, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     found = list(json.loads(done.stdout).values())
     assert found.count("ended") == 4
-    assert sum(each.startswith("lost by Ray: ") for each in found) == 1
+    assert sum(state.startswith("lost by Ray: ") for state in found) == 1
     told = [json.loads(path.read_text().splitlines()[0]) for path in tmp_path.glob("?")]
-    assert [each["gpus"] for each in told] == ["0"] * 4, "each node has one of that number"
-    nodes = [each["grandparent"] for each in told]
+    assert [facts["gpus"] for facts in told] == ["0"] * 4, "each node has one of that number"
+    nodes = [facts["grandparent"] for facts in told]
     assert sorted(map(nodes.count, set(nodes))) == [2, 2]
 
 

@@ -1,9 +1,8 @@
-"""A running point: how its job ends, and the files that are read meanwhile."""
+"""A running point: how its job ends, and the files that are read meanwhile; averaged scores."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,12 +12,12 @@ import pytest
 from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.point import Point
+from sweeps.plan.planner import PlannedPoint
+from sweeps.point import Outcome, Point
 from sweeps.run import running_point
-from sweeps.run.driver import work_of
+from sweeps.run.point_state import work_of
 from sweeps.run.run_store import RunStore
-from sweeps.run.running_point import End, PruningCallback, RunningPoint, Task
-from sweeps.settings import Objective
+from sweeps.run.running_point import RunningPoint
 from tests.sweeps.fakes import (
     Behaviour,
     FakeExecutor,
@@ -36,28 +35,25 @@ PLAN = plan_of(Point("p", ("x=1",)))
 
 
 class Bench:
-    """A point and its job."""
+    """A point and its job; `steps` are those of the validations that are reported."""
 
-    def __init__(
-        self,
-        runs_dir: Path,
-        behaviour: Behaviour = succeed,
-        report: PruningCallback | None = None,
-        plan: Any = PLAN,
-        begin: int = 0,
-    ) -> None:
+    def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed, plan: Any = PLAN) -> None:
         self.executor, self.runs = FakeExecutor(behaviour), RunStore(runs_dir, NoTracking())
         work = work_of(plan, self.runs, "")
         (job,) = self.executor.submit([work])
-        self.point = RunningPoint(Task(plan, 0, report), job, work.log, begin)
+        self.point, self.steps = RunningPoint(plan, job, work.log, 0), list[int]()
 
-    def advance(self) -> End | None:
-        return self.point.advance(self.executor, self.runs)
+    def report(self, plan: PlannedPoint, line: MetricLine) -> str:
+        self.steps.append(line.step)
+        return ""
 
-    def run(self) -> End:
-        while (end := self.advance()) is None:
+    def advance(self) -> Outcome | None:
+        return self.point.advance(self.executor, self.runs, self.report)
+
+    def run(self) -> Outcome:
+        while (outcome := self.advance()) is None:
             pass
-        return end
+        return outcome
 
 
 def test_a_point_is_followed_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +73,8 @@ def test_a_point_is_followed_to_its_end(tmp_path: Path, monkeypatch: pytest.Monk
     assert str(seen) == "[(True, 0, nan), (True, 2, nan), (True, 4, 0.0)]"
     assert bench.point.score == 0.2
     end = bench.run()
-    assert (end.state, end.reason, end.seconds) == ("finished", "", 30.0)
+    assert (end.state, end.reason, end.job_s) == ("finished", "", 30.0)
+    assert end.keys == (PLAN.key,)
     assert end.results == (RunResult(tmp_path / PLAN.key),)
 
 
@@ -113,50 +110,35 @@ def test_scores_are_averaged_where_all_runs_have_them(tmp_path: Path) -> None:
     finish(tmp_path / "b", val={"mIoU": 0.25}, test={"mIoU": 0.75, "Var": 1.0, "class/car": 0.5})
     found = tuple(RunResult(tmp_path / key) for key in "ab")
     means = {"val/mIoU": 37.5, "test/mIoU": 50.0, "test/Var": 5.0}
-    assert End("finished", results=found).scores() == means
-    assert End("finished", results=found[::-1]).scores() == means
-
-
-@pytest.mark.parametrize("score", [None, math.inf, 0.5])
-def test_a_score_that_is_no_number_fails(tmp_path: Path, score: float | None) -> None:
-    finish(tmp_path / "a", test={"mIoU": score, "Var": 1.0})
-    end = End("finished", results=(RunResult(tmp_path / "a"),))
-    checked = end.checked((Objective("test/mIoU", "maximize"),))
-    assert checked.state == ("finished" if score == 0.5 else "failed")
-    assert ("no test/mIoU that is a number" in checked.reason) == (score != 0.5)
-
-
-def told(steps: list[int]) -> Callable[[MetricLine], str]:
-    return lambda line: steps.append(line.step) or ""
+    for results in (found, found[::-1]):
+        assert Outcome(Point("p", ()), "finished", results=results).scores() == means
 
 
 def test_validations_of_the_first_seed_are_reported(tmp_path: Path) -> None:
-    plan, steps = plan_of(Point("p", ("x=1",), seeds=(0, 1))), list[int]()
-    seeds = nth(scored(0.2, 0.4), scored(0.2, 0.4, 0.5))
-    end = Bench(tmp_path, seeds, told(steps), plan).run()
-    assert [each.key for each in end.results] == [run.key for run in plan.runs]
-    assert steps == [2, 4]
+    plan = plan_of(Point("p", ("x=1",), seeds=(0, 1)))
+    bench = Bench(tmp_path, nth(scored(0.2, 0.4), scored(0.2, 0.4, 0.5)), plan)
+    assert [result.key for result in bench.run().results] == [run.key for run in plan.runs]
+    assert bench.steps == [2, 4]
 
 
-def test_a_report_that_was_not_stored_is_repeated(tmp_path: Path) -> None:
-    steps: list[int] = []
+def test_a_report_that_was_not_stored_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(plan: PlannedPoint, line: MetricLine) -> str:
+        bench.steps.append(line.step)
+        raise ConnectionError("the storage is away for a moment")
 
-    def report(line: MetricLine) -> str:
-        steps.append(line.step)
-        if len(steps) == 1:
-            raise ConnectionError("the storage is away for a moment")
-        return ""
-
-    bench = Bench(tmp_path, report=report)
-    with pytest.raises(ConnectionError):
-        bench.run()
+    bench = Bench(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(bench, "report", away)
+        with pytest.raises(ConnectionError):
+            bench.run()
     assert bench.run().state == "finished"
-    assert steps == [2, 2, 4]
+    assert bench.steps == [2, 2, 4]
 
 
 def test_whole_lines_are_reported_once(tmp_path: Path) -> None:
-    steps: list[int] = []
-    bench = Bench(tmp_path, hang, told(steps))
+    bench = Bench(tmp_path, hang)
     assert bench.advance() is None
     run = RunFolder(tmp_path / PLAN.key)
     run.append(1, "train", {"loss": 2.0})
@@ -167,9 +149,9 @@ def test_whole_lines_are_reported_once(tmp_path: Path) -> None:
             file.write(part)
             file.flush()
             assert bench.advance() is None
-            assert (steps, bench.point.score) == (seen, score)
+            assert (bench.steps, bench.point.score) == (seen, score)
     run.truncate_after(2)  # a run that resumes writes its lines again
     run.append(3, "val", {"mIoU": 0.1})
     run.append(4, "val", {"mIoU": 0.2})
     assert bench.advance() is None
-    assert (steps, bench.point.step) == ([2, 3, 4], 4)
+    assert (bench.steps, bench.point.step) == ([2, 3, 4], 4)

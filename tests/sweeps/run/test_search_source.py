@@ -13,10 +13,12 @@ from optuna.trial import TrialState, create_trial
 
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
+from rgbt.runs.result import RunResult
 from sweeps import attributes as names
-from sweeps.point import Point
-from sweeps.run.running_point import Task
+from sweeps.point import Outcome, Point
+from sweeps.run.search_source import checked
 from sweeps.settings import Objective
+from sweeps.space import build_sampler
 from tests.sweeps.fakes import (
     Call,
     FakePlanner,
@@ -35,26 +37,20 @@ from tests.sweeps.fakes import (
 UP = (Objective("val/mIoU", "maximize"),)
 
 
-def taken(desk: SearchDesk) -> Task:
-    task = desk.source.next()
-    assert task is not None
-    return task
-
-
 def test_the_sampler_is_asked_and_the_point_noted(tmp_path: Path) -> None:
     desk = SearchDesk(tmp_path, trials=2)
-    task = taken(desk)
-    (override,) = task.plan.point.overrides
+    plan = desk.next()
+    point = plan.point
+    (override,) = point.overrides
     x = float(override.removeprefix("x="))
     assert 0 <= x <= 1
     (trial,) = desk.trials
     assert trial.params == {"x": x}
     assert trial.user_attrs == {
-        names.RUNS: [task.plan.key],
+        names.RUNS: [plan.key],
         names.LABEL: f"#0 x={x:.4g}",
         names.PIXELS: 1.0,
     }
-    point = task.plan.point
     assert point.tags == {"rgbt.study/study": "0", VARIED: "x"}
     assert (point.label, point.seeds) == (f"#0 x={x:.4g}", ())
 
@@ -89,15 +85,13 @@ def line(step: int, **values: float) -> MetricLine:
 @pytest.mark.filterwarnings("error:.*already")
 def test_validations_are_reported_once_each_in_percent(tmp_path: Path) -> None:
     desk = SearchDesk(tmp_path, objectives=UP, trials=1)
-    report = taken(desk).report
-    assert report is not None
-    for each in (line(2, mIoU=0.5, Var=9.0), line(4, mIoU=0.125), line(6, loss=1.0)):
-        assert report(each) == ""
+    plan = desk.next()
+    for validation in (line(2, mIoU=0.5, Var=9.0), line(4, mIoU=0.125), line(6, loss=1.0)):
+        assert desk.source.report(plan, validation) == ""
     again = SearchDesk(tmp_path, objectives=UP, trials=1, storage=desk.storage)
-    report = taken(again).report
-    assert report is not None
-    for each in (line(2, mIoU=0.25), line(4, mIoU=0.25), line(8, mIoU=math.nan)):
-        assert report(each) == ""
+    plan = again.next()
+    for validation in (line(2, mIoU=0.25), line(4, mIoU=0.25), line(8, mIoU=math.nan)):
+        assert again.source.report(plan, validation) == ""
     (trial,) = desk.trials
     assert {k: v for k, v in trial.intermediate_values.items() if k < 8} == {2: 50.0, 4: 12.5}
     assert math.isnan(trial.intermediate_values[8])
@@ -105,12 +99,10 @@ def test_validations_are_reported_once_each_in_percent(tmp_path: Path) -> None:
 
 def test_var_is_no_percentage_and_two_objectives_are_not_reported(tmp_path: Path) -> None:
     var = Objective("val/Var", "minimize")
-    desk = SearchDesk(tmp_path, objectives=(var,), trials=1)
-    report = taken(desk).report
-    assert report is not None
-    report(line(2, mIoU=0.5, Var=9.0))
-    assert desk.trials[0].intermediate_values == {2: 9.0}
-    assert taken(SearchDesk(tmp_path, objectives=(*UP, var), trials=1)).report is None
+    for objectives, reported in (((var,), {2: 9.0}), ((*UP, var), {})):
+        desk = SearchDesk(tmp_path, objectives=objectives, trials=1)
+        assert desk.source.report(desk.next(), line(2, mIoU=0.5, Var=9.0)) == ""
+        assert desk.trials[0].intermediate_values == reported
 
 
 def test_a_stored_parameter_outside_the_space_is_not_composed(tmp_path: Path) -> None:
@@ -122,7 +114,7 @@ def test_a_stored_parameter_outside_the_space_is_not_composed(tmp_path: Path) ->
     stored = {"x": 0.5, "hydra.searchpath": "[pkg://evil]"}
     waiting = create_trial(state=TrialState.WAITING, params=stored, distributions=kinds)
     desk.study.add_trial(waiting)
-    point = taken(desk).plan.point
+    point = desk.next().point
     assert (point.overrides, dict(point.params)) == (("x=0.5",), {"x": 0.5})
 
 
@@ -151,12 +143,13 @@ def test_a_trial_whose_driver_was_killed_while_it_asked_gets_its_parameters(
 ) -> None:
     space = {key: {"type": "float", "low": 0, "high": 1} for key in "xy"}
     whole = SearchDesk(tmp_path, space=space, trials=1)
-    wanted = taken(whole).plan.point.overrides
+    wanted = whole.next().point.overrides
     for known in ((), ("x",)):
         desk = SearchDesk(tmp_path, space=space, trials=1)
+        desk.study.sampler = build_sampler(desk.settings.sampler, 0)
         desk.study.ask({key: FloatDistribution(0, 1) for key in known})
         again = SearchDesk(tmp_path, space=space, trials=1, storage=desk.storage)
-        found = taken(again).plan.point.overrides
+        found = again.next().point.overrides
         assert [word[:2] for word in found] == ["x=", "y="]
         assert found[0] == wanted[0]
         assert len(again.trials) == 1
@@ -164,10 +157,19 @@ def test_a_trial_whose_driver_was_killed_while_it_asked_gets_its_parameters(
 
 def test_a_run_that_ended_without_a_driver_is_said_as_it_counts(tmp_path: Path) -> None:
     desk = SearchDesk(tmp_path, trials=1)
-    finish(tmp_path / taken(desk).plan.key, test={"mIoU": None})
+    finish(tmp_path / desk.next().key, test={"mIoU": None})
     again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
     assert (again.states(), again.executor.submits) == (["FAIL"], [])
-    assert [how for how, _ in again.view.said] == ["failed"]
+    assert [state for state, _ in again.view.said] == ["failed"]
+
+
+@pytest.mark.parametrize("score", [None, math.inf, 0.5])
+def test_a_score_that_is_no_number_fails(tmp_path: Path, score: float | None) -> None:
+    finish(tmp_path / "a", test={"mIoU": score, "Var": 1.0})
+    outcome = Outcome(Point("p", ()), "finished", results=(RunResult(tmp_path / "a"),))
+    counted = checked(outcome, (Objective("test/mIoU", "maximize"),))
+    assert counted.state == ("finished" if score == 0.5 else "failed")
+    assert ("no test/mIoU that is a number" in counted.reason) == (score != 0.5)
 
 
 def test_a_new_trial_is_run_whatever_failed_before(tmp_path: Path) -> None:
@@ -180,10 +182,10 @@ def test_a_new_trial_is_run_whatever_failed_before(tmp_path: Path) -> None:
 
 def test_a_trial_that_failed_without_a_driver_is_not_run_again(tmp_path: Path) -> None:
     desk = SearchDesk(tmp_path, trials=1)
-    lost = taken(desk)
-    ListDesk(tmp_path, [lost.plan.point], fail).run()
+    ListDesk(tmp_path, [desk.next().point], fail).run()
     again = SearchDesk(tmp_path, trials=1, storage=desk.storage).run()
     assert (again.states(), again.executor.submits) == (["FAIL"], [])
+    assert again.trials[0].user_attrs[names.REASON] == "ValueError: a bad day"
 
 
 SPACE = {

@@ -14,7 +14,7 @@ import pytest
 
 from rgbt.checks import RunError
 from sweeps.run import submitit_jobs as jobs
-from sweeps.run.job import Step, Work, failure_reason
+from sweeps.run.job import Work, failure_reason
 from sweeps.run.submitit_jobs import SubmititExecutor, SubmititJob
 from tests.sweeps import clusters
 from tests.waiting import until
@@ -39,26 +39,30 @@ def slurm_executor(folder: Path, **options: Any) -> SubmititExecutor:
     return SubmititExecutor("slurm", {**given, "cpus_per_task": 1, **options}, None)
 
 
-def works(folder: Path, count: int = 1, what: str = "train") -> list[Work]:
+def works(folder: Path, count: int = 1) -> list[Work]:
     """Points whose commands wait for a file "own.go" in their folders."""
     found = []
     for key in "abcd"[:count]:
         place = folder / key
         place.mkdir(exist_ok=True)
-        step = Step((STEPS, what, str(place / "own")), place)
-        found.append(Work(key, (step,), {}, folder / ".logs" / f"{key}.log", folder))
+        steps = {(STEPS, "train", str(place / "own")): place}
+        found.append(Work(key, steps, {}, folder / ".logs" / f"{key}.log", folder))
     return found
+
+
+def run_folder(work: Work) -> Path:
+    return work.folder / work.key
 
 
 def begun(work: Work) -> int:
     """How often its command has begun."""
-    file = work.steps[0].folder / "steps"
+    file = run_folder(work) / "steps"
     return len(file.read_text().splitlines()) if file.exists() else 0
 
 
 def go(*some: Work) -> None:
     for work in some:
-        (work.steps[0].folder / "own.go").touch()
+        (run_folder(work) / "own.go").touch()
 
 
 def send(job: str, *signals: str) -> None:
@@ -133,17 +137,6 @@ def test_signal_of_the_first_moment_queues_again(tmp_path: Path) -> None:
     go(*points)
     assert end(executor, job) == ["ended"]
     assert failure_reason(points[0].log, 0) == ""
-
-
-def test_cancelled_by_the_user(tmp_path: Path) -> None:
-    executor, points = slurm_executor(tmp_path), works(tmp_path, 2)
-    names = executor.submit(points)
-    until(lambda: all(map(begun, points)), "the commands")
-    subprocess.run(["scancel", names[0]], check=True)
-    assert end(executor, names[0]) == ["cancelled"]
-    go(points[1])
-    assert end(executor, names[1]) == ["ended"]
-    assert failure_reason(points[1].log, 0) == ""
 
 
 def test_cancel_saves_what_runs_and_removes_what_waits(tmp_path: Path) -> None:

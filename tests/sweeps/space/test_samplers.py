@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 import optuna
 import pytest
-from optuna.trial import TrialState
 
 from rgbt.checks import InputError
 from sweeps.space import build_pruner, build_sampler, parse_space, trial_seed
@@ -38,21 +36,19 @@ def node(name: str, **options: Any) -> dict[str, Any]:
     return {"_target_": f"optuna.{room}.{name}", **options}
 
 
-def study_on(storage: Any, name: str, objectives: int = 1) -> optuna.Study:
-    """What a driver opens: a study of its own on a storage that all share."""
-    return optuna.create_study(
-        storage=storage,
-        study_name="s",
-        load_if_exists=True,
-        directions=["minimize"] * objectives,
-        sampler=build_sampler(node(f"{name}Sampler", seed=7, **EARLY.get(name, {}))),
+def search_on(storage: Any, objectives: int = 1) -> optuna.Study:
+    """What a driver opens: a study of a storage."""
+    directions = ["minimize"] * objectives
+    study: optuna.Study = optuna.create_study(
+        storage=storage, study_name="s", load_if_exists=True, directions=directions
     )
+    return study
 
 
-def step(study: optuna.Study) -> None:
-    trial = study.ask(SPACE)
-    values = trial.params
-    study.tell(trial, [values["x"], values["n"] - values["x"]][: len(study.directions)])
+def ask(study: optuna.Study, name: str) -> optuna.Trial:
+    sampler = node(f"{name}Sampler", seed=7, **EARLY.get(name, {}))
+    study.sampler = build_sampler(sampler, len(study.trials))
+    return study.ask(SPACE)
 
 
 @pytest.mark.parametrize(
@@ -63,44 +59,34 @@ def step(study: optuna.Study) -> None:
     ],
 )
 def test_sampler_resumed_search_repeats_draws(name: str, objectives: int) -> None:
-    whole = study_on(None, name, objectives)
+    def step(study: optuna.Study) -> None:
+        trial = ask(study, name)
+        values = trial.params
+        study.tell(trial, [values["x"], values["n"] - values["x"]][:objectives])
+
+    whole = search_on(None, objectives)
     for _ in range(8):
         step(whole)
     storage = optuna.storages.InMemoryStorage()
     for trials in (2, 1, 3, 2):
-        resumed = study_on(storage, name, objectives)
+        resumed = search_on(storage, objectives)
         for _ in range(trials):
             step(resumed)
-    found, repeated = ([trial.params for trial in each.trials] for each in (whole, resumed))
+    found, repeated = ([trial.params for trial in study.trials] for study in (whole, resumed))
     assert found == repeated
     assert len({point["x"] for point in found}) > 4
 
 
-@pytest.mark.parametrize("name", ["TPE", "Random"])
-def test_sampler_shared_seed_draws_differ(name: str, tmp_path: Path) -> None:
-    drivers = [study_on(f"sqlite:///{tmp_path}/studies.db", name) for _ in range(3)]
-    for _ in range(3):
-        running = [(study, study.ask(SPACE)) for study in drivers]
-        for study, trial in running:
-            study.tell(trial, trial.params["x"])
-    assert len({trial.params["x"] for trial in drivers[0].trials}) == 9
-
-
-def test_sampler_concurrent_trials_keep_own_draws() -> None:
+def test_sampler_concurrent_trials_differ_and_keep_own_draws() -> None:
     """Asked together or one by one, told in any order: random points are those of their numbers."""
-    together, single = (study_on(None, "Random") for _ in range(2))
-    running = [together.ask(SPACE) for _ in range(4)]
+    together, single = search_on(None), search_on(None)
+    running = [ask(together, "Random") for _ in range(4)]
     for trial in running[2:] + running[:2]:
         together.tell(trial, 1.0)
     for _ in range(4):
-        step(single)
+        single.tell(ask(single, "Random"), 1.0)
     assert [trial.params for trial in together.trials] == [trial.params for trial in single.trials]
-
-
-def test_sampler_ends_trial_of_other_driver() -> None:
-    storage = optuna.storages.InMemoryStorage()
-    number = study_on(storage, "TPE").ask().number
-    assert study_on(storage, "TPE").tell(number, 1.0).state == TrialState.COMPLETE
+    assert len({trial.params["x"] for trial in single.trials}) == 4
 
 
 def test_trial_seed_differs_by_seed_and_number() -> None:
@@ -113,6 +99,7 @@ def test_trial_seed_differs_by_seed_and_number() -> None:
     [
         (node("QMCSampler"), "_target_"),
         (node("TPESampler", n_startup=3), "n_startup"),
+        (node("TPESampler", seed="x"), "seed"),
         (node("TPESampler", group=True, multivariate=False), ""),
         (node("MeanPruner"), "_target_"),
         (node("PercentilePruner"), "percentile"),
@@ -122,13 +109,12 @@ def test_trial_seed_differs_by_seed_and_number() -> None:
 def test_sampler_and_pruner_mistakes_are_refused(wrong: dict[str, Any], key: str) -> None:
     what = "pruner" if "Pruner" in wrong.get("_target_", "") else "sampler"
     with pytest.raises(InputError, match=f"hydra.sweeper.{what}.{key}"):
-        build_pruner(wrong) if what == "pruner" else build_sampler(wrong)
+        build_pruner(wrong) if what == "pruner" else build_sampler(wrong, 0)
 
 
 def test_options_reach_optuna() -> None:
-    sampler = build_sampler(node("NSGAIISampler", population_size=6, seed=3))
-    assert sampler.make(0).population_size == 6  # type: ignore[attr-defined]
-    assert sampler.seed == 3
+    sampler: Any = build_sampler(node("NSGAIISampler", population_size=6, seed=3), 0)
+    assert sampler.population_size == 6
     inner = node("MedianPruner", n_startup_trials=9)
     pruner: Any = build_pruner(node("PatientPruner", patience=1, wrapped_pruner=inner))
     assert pruner._wrapped_pruner._n_startup_trials == 9

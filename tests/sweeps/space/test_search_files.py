@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from rgbt.config.compose import conf_dir, flatten, register_resolvers
 from rgbt.runs.specify import specify
-from sweeps.settings import Launcher, read_settings
+from sweeps.settings import read_settings
 from sweeps.space import Space, build_pruner, build_sampler, ends, parse_space
 from tests.models.golden import compose
 
@@ -23,7 +23,7 @@ def composed(*overrides: str) -> DictConfig:
 
 
 def space_of(name: str) -> Space:
-    return parse_space(read_settings(composed(f"+search={name}").hydra.sweeper, Launcher()).space)
+    return parse_space(read_settings(composed(f"+search={name}").hydra).space)
 
 
 @pytest.mark.parametrize(
@@ -33,9 +33,9 @@ def test_search_file_is_a_search_of_its_experiment(name: str) -> None:
     config = composed(f"+search={name}")
     assert config.hydra.runtime.choices["hydra/sweeper"] == "study"
     assert config.hydra.mode.name == "MULTIRUN"
-    settings = read_settings(config.hydra.sweeper, Launcher())
+    settings = read_settings(config.hydra)
     assert settings.trials
-    build_sampler(settings.sampler)
+    build_sampler(settings.sampler, 0)
     build_pruner(settings.pruner)
     for overrides in ends(parse_space(settings.space)):
         single = compose(f"+search={name}", *overrides)

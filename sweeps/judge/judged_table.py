@@ -1,0 +1,384 @@
+"""A table judged by its finished runs: scores, claims with verdicts, rows shown to be the best.
+
+A claim is made of contrasts of rows, or of effects of a design. Each is a weighted sum of scores,
+formed for every seed that all its rows have, because the runs of one seed share their initial
+weights and the order of their data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from statistics import fmean
+
+from analysis.uncertainty import Interval, Resampling
+from analysis.uncertainty.contrasts import Evidence, Resampler, Term
+from analysis.uncertainty.same_images import Alike
+from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, Verdict, decide
+from rgbt.checks import InputError
+from rgbt.metrics import names
+from rgbt.runs.result import RunResult
+from sweeps.judge.contrasts import (
+    Cell,
+    Contrast,
+    as_claimed,
+    base_scores,
+    contrasts_of,
+    difference,
+    effects_claimed,
+    printed_values,
+)
+from sweeps.judge.reader import RunReader
+from sweeps.plan.claim import HIGHER, LOWER, Claim
+from sweeps.plan.request import UNTIL_DECIDED, RowSeed, TableRequest
+from sweeps.plan.table import Column, is_counted, metric_of, words_of, world_words
+from sweeps.point import Outcome
+from sweeps.score.cells import CellId, ScoredTable, TableCell, score, size_marks
+
+# Resamples of the images: enough to know a standard error to 2 %.
+RESAMPLES = 2_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedClaim:
+    """A claim with its verdict, and what the verdict is about.
+
+    Attributes:
+        table: its name, e.g. "spatialseg/table3".
+        contrast: the one whose numbers the verdict shows; of a mean, the claim itself.
+        printed: the same contrast of the printed values; None where one is missing.
+        as_printed: whether the printed values agree with the claim; None: some are missing.
+        verdict: None where no contrast could be computed.
+        missing: labels of rows without a finished run, in the order of the table.
+        complete: whether every contrast of it could be computed.
+        reason: why there is no verdict, or why it is undecided; one sentence, or "".
+        images: "synthetic", "real" or "unknown"; of several kinds of runs all kinds; "": no runs.
+        scale: of the runs, in the same way.
+        starts: number of different initial weights of the runs.
+        warnings: rows of different lists; rows of one seed that were trained on different machines.
+    """
+
+    table: str
+    claim: Claim
+    contrast: str
+    printed: float | None = None
+    as_printed: bool | None = None
+    verdict: Verdict | None = None
+    missing: tuple[str, ...] = ()
+    complete: bool = False
+    reason: str = ""
+    images: str = ""
+    scale: str = ""
+    starts: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def word(self) -> str:
+        """The kind of the verdict: "holds", "contradicted", "undecided"; or "not run"."""
+        return "not run" if self.verdict is None else self.verdict.kind
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedTable:
+    """A table, the runs of its rows, and what they show.
+
+    `replace(judged, runs=...)` judges further runs and keeps what was read and resampled.
+
+    Attributes:
+        request: of a table that is read from tags of runs, `extra` are words to show, not to
+            compose.
+        runs: by label of the row and seed.
+        sizes: cells that are counted without a run.
+    """
+
+    request: TableRequest
+    runs: Mapping[RowSeed, Outcome] = field(default_factory=dict)
+    sizes: Mapping[CellId, TableCell] = field(default_factory=dict)
+    resamples: int = RESAMPLES
+    reader: RunReader = field(default_factory=RunReader)
+    resamplers: dict[Alike, Resampler] = field(default_factory=dict)
+
+    @cached_property
+    def scored(self) -> ScoredTable:
+        """Our values, with marks of the best rows (`score`)."""
+        request, table = self.request, self.request.table
+        scored = score(
+            request.name,
+            table,
+            self.runs,
+            scale=request.scale,
+            sizes=self.sizes,
+            reader=self.reader.counts,
+        )
+        marks = self._marks(scored) | size_marks(table, self.sizes)
+        return replace(scored, form=request.form, marks=marks)
+
+    @cached_property
+    def claims(self) -> list[JudgedClaim]:
+        """Every claim of the table, judged by the finished runs."""
+        return [self._judge(claim) for claim in self.request.table.claims]
+
+    @cached_property
+    def rule(self) -> Rule:
+        """When a claim is decided: a rule valid at any time where results decided how many runs.
+
+        The tag of any table counts, because tables share runs.
+        """
+        if self.request.until_decided:
+            return AnyTime()
+        for outcome in self.runs.values():
+            for run in outcome.results:
+                if any(name.startswith(UNTIL_DECIDED) for name in run.tags):
+                    return AnyTime()
+        return FixedSeeds()
+
+    def resampler(self, alike: Alike = "labels") -> Resampler:
+        """Return the engine for images with equal labels, or "names" for the worlds of a design.
+
+        Generated scenes are independent, and each world has its own labels.
+        """
+        if alike not in self.resamplers:
+            settings = Resampling(resamples=self.resamples, absent=self.request.table.absent)
+            if alike == "names":
+                settings = replace(settings, blocks="none")
+            self.resamplers[alike] = Resampler(settings, alike)
+        return self.resamplers[alike]
+
+    def terms(self, cells: Sequence[Cell]) -> list[Term]:
+        """Return the scores of counts, by seed, that a weighted sum of cells is made of.
+
+        InputError: a row has no finished run or not the score, or the rows are the same runs.
+        """
+        terms = self._terms(cells)
+        if _are_same(terms):
+            rows = " and ".join(dict.fromkeys(f"'{cell.row}'" for cell in cells))
+            raise InputError(f"rows {rows} are the same runs at this scale.")
+        return terms
+
+    def _terms(self, cells: Sequence[Cell]) -> list[Term]:
+        """The `terms` of rows that may be the same runs."""
+        terms = []
+        for cell in cells:
+            terms += self._cell_terms(cell)
+        return terms
+
+    def _cell_terms(self, cell: Cell) -> list[Term]:
+        table = self.request.table
+        rows = {row.label: row for row in table.rows}
+        runs = self._finished(cell.row)
+        if cell.row not in rows or not runs:
+            raise InputError(f"row '{cell.row}' has no finished run.")
+        row = rows[cell.row]
+        if cell.column not in {column.name for column in table.columns_of(row)}:
+            raise InputError(f"row '{cell.row}' has no score '{cell.column}'.")
+        terms = []
+        for part, column in base_scores(table, row, cell.column):
+            if not is_counted(column):
+                raise InputError(f"column '{column.name}' is not a score of images.")
+            words = words_of(column, table)
+            if cell.world:
+                plain = Column(name=names.MIOU, metric=names.MIOU)
+                if words != words_of(plain, table):
+                    raise InputError(f"'{column.name}' is no score of the plain test images.")
+                words = world_words(table, row)[cell.world]
+            # Another table may have trained further seeds, without this measurement.
+            counted = {s: run for s, run in runs.items() if self.reader.has_counts(run, words)}
+            used = counted or runs
+            term = Term(
+                weight=cell.weight * part,
+                metric=metric_of(column, row),
+                counts={seed: self.reader.counts(run, words) for seed, run in used.items()},
+                keys={seed: f"{run.key}/{' '.join(words)}" for seed, run in used.items()},
+            )
+            terms.append(term)
+        return terms
+
+    def _finished(self, label: str) -> dict[int, RunResult]:
+        """The finished runs of a row, by seed."""
+        runs = {}
+        for (row, seed), outcome in self.runs.items():
+            if row == label and outcome.state == "finished" and outcome.results:
+                runs[seed] = outcome.results[0]
+        return runs
+
+    def _judge(self, claim: Claim) -> JudgedClaim:
+        """Judge one claim; a contrast without scores leaves a claim about all of them undecided."""
+        table = self.request.table
+        contrasts = contrasts_of(claim, table)
+        if claim.effect:
+            assert table.design is not None, "a claim about an effect is about a design"
+            contrasts = effects_claimed(claim, table.design)
+        named = {cell.row for contrast in contrasts for cell in contrast.cells}
+        labels = [row.label for row in table.rows if row.label in named]
+        finished = {label: self._finished(label) for label in labels}
+        values = printed_values(table)
+        printed = [contrast.of_values(values) for contrast in contrasts]
+        judged = JudgedClaim(
+            table=self.request.name,
+            claim=claim,
+            contrast=contrasts[0].label,
+            printed=printed[0],
+            as_printed=as_claimed(claim, printed),
+            missing=tuple(label for label, runs in finished.items() if not runs),
+        )
+
+        # Sizes of networks are counted, not estimated.
+        sizes = {cell: size.mean for cell, size in self.sizes.items() if not math.isnan(size.mean)}
+        exact = [contrast.of_values(sizes) for contrast in contrasts]
+        is_so = as_claimed(claim, exact)
+        if is_so is not None:
+            verdict = _exact_verdict(exact[0] or 0.0, is_so=is_so)
+            return replace(judged, verdict=verdict, complete=True)
+
+        is_mean = claim.combine == "mean"
+        if is_mean:
+            judged = replace(judged, printed=_mean(printed))
+        groups = [contrasts] if is_mean else [[contrast] for contrast in contrasts]
+        alike: Alike = "names" if claim.effect else "labels"
+        evidences: dict[int, Evidence] = {}
+        reasons: list[str] = []
+        for place, group in enumerate(groups):
+            try:
+                evidences[place] = self._evidence(group, alike)
+            except InputError as error:
+                reasons.append(str(error))
+        if not evidences:
+            return replace(judged, reason=reasons[0])
+        runs = [run for runs in finished.values() for run in runs.values()]
+        origins = [self.reader.origin(run) for run in runs]
+        starts = len({origin.start for origin in origins})
+        verdict = decide(
+            list(evidences.values()),
+            claim.range,
+            self.rule,
+            claim.combine,
+            starts=starts,
+            missing=f"Some rows have no score: {reasons[0]}" if reasons else "",
+        )
+        shown = list(evidences)[verdict.decisive]
+        if is_mean:
+            judged = replace(judged, contrast=f"mean of {len(contrasts)} contrasts")
+        else:
+            judged = replace(judged, contrast=contrasts[shown].label, printed=printed[shown])
+        return replace(
+            judged,
+            verdict=verdict,
+            complete=not reasons,
+            reason=verdict.reason,
+            images=" and ".join(sorted({origin.images for origin in origins})),
+            scale=" and ".join(sorted({origin.scale for origin in origins})),
+            starts=starts,
+            warnings=self._warnings(finished),
+        )
+
+    def _evidence(self, contrasts: Sequence[Contrast], alike: Alike) -> Evidence:
+        """The evidence about the mean of contrasts."""
+        terms = []
+        for contrast in contrasts:
+            for term in self.terms(contrast.cells):
+                terms.append(replace(term, weight=term.weight / len(contrasts)))
+        return self.resampler(alike).evidence(terms)
+
+    def _warnings(self, rows: Mapping[str, Mapping[int, RunResult]]) -> tuple[str, ...]:
+        """What differs between runs that are compared: their lists, and the machines of a seed."""
+        lists: dict[str, dict[str, None]] = {}
+        machines: dict[int, set[str]] = {}
+        for label, runs in rows.items():
+            for seed, run in runs.items():
+                origin = self.reader.origin(run)
+                if origin.lists:
+                    lists.setdefault(origin.lists, {})[label] = None
+                machines.setdefault(seed, set())
+                if origin.machine:
+                    machines[seed].add(origin.machine)
+        warnings = []
+        if len(lists) > 1:
+            shown = "; ".join(f"{', '.join(labels)} {text}" for text, labels in lists.items())
+            warnings.append(f"Different lists: {shown}.")
+        mixed = [str(seed) for seed, known in machines.items() if len(known) > 1]
+        if mixed:
+            warnings.append(f"Seeds {', '.join(mixed)} mix machines, which train differently.")
+        return tuple(warnings)
+
+    def _marks(self, scored: ScoredTable) -> dict[CellId, int]:
+        """Rank 1 of a row that is shown to be better than all others of a column; 2 the next.
+
+        A row is shown to be better where the interval of its difference to each other row excludes
+        0; a row without a score may be better than all others. Rows of the same runs share a mark.
+        Nothing is marked with fewer than two seeds.
+        """
+        marks: dict[CellId, int] = {}
+        present = {label for label, _ in self.runs}
+        for column in self.request.table.columns:
+            if column.best == "none" or not (is_counted(column) or column.sources):
+                continue
+            cells = {
+                label: cell
+                for (label, name), cell in scored.cells.items()
+                if name == column.name and label in present
+            }
+            if any(cell.reason or math.isnan(cell.mean) for cell in cells.values()):
+                continue
+            left = {label: cell.mean for label, cell in cells.items()}
+            for rank in (1, 2):
+                best = self._best(column, left)
+                if not best:
+                    break
+                for label in best:
+                    marks[label, column.name] = rank
+                    del left[label]
+        return marks
+
+    def _best(self, column: Column, means: Mapping[str, float]) -> list[str]:
+        """The row, and others of the same runs, that is shown to be better than all others."""
+        if len(means) < 2:
+            return []
+        if column.best == "highest":
+            best, wanted = max(means, key=lambda label: means[label]), HIGHER
+        else:
+            best, wanted = min(means, key=lambda label: means[label]), LOWER
+        same = [best]
+        others = means.keys() - {best}
+        # The nearest row first: if it cannot be told apart, the others need no interval.
+        for label in sorted(others, key=lambda other: abs(means[other] - means[best])):
+            try:
+                terms = self._terms(difference(best, label, column.name).cells)
+                if _are_same(terms):
+                    same.append(label)
+                    continue
+                evidence = self.resampler().evidence(terms)
+            except InputError:
+                return []
+            if decide([evidence], wanted, self.rule, "all").kind != "holds":
+                return []
+        return same if len(same) < len(means) else []
+
+
+def _are_same(terms: Sequence[Term]) -> bool:
+    """Whether a sum of scores is one of the same scores of the same runs, and so is nothing."""
+    sums: dict[tuple[str, ...], float] = {}
+    for term in terms:
+        source = (term.metric, *term.keys.values())
+        sums[source] = sums.get(source, 0.0) + term.weight
+    return not any(sums.values())
+
+
+def _exact_verdict(value: float, *, is_so: bool) -> Verdict:
+    return Verdict(
+        kind="holds" if is_so else "contradicted",
+        estimate=value,
+        interval=Interval(value, value),
+        covers="none",
+        smallest=0.0,
+        seeds=0,
+        seeds_needed=0,
+        decisive=0,
+        reason="Counted, not estimated.",
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None

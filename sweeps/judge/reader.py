@@ -1,0 +1,105 @@
+"""Reads finished runs for verdicts: their tags, their counts, and what their settings say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.runs.result import RunResult
+from rgbt.runs.run_spec import RunSpec
+from sweeps.plan.measurement import Words, counts_of, stored_at
+
+SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+
+# Errors that the tags of a run may raise that somebody has edited.
+ODD = (InputError, KeyError, ValueError, TypeError)
+
+
+class Origin(NamedTuple):
+    """What a run was made of.
+
+    Attributes:
+        images: "synthetic", "real" or "unknown".
+        start: equal for runs that began from the same weights.
+        lists: which lists it was trained and selected on, in words, or "".
+        machine: graphics card or processor, or "" where it was not recorded.
+    """
+
+    images: str
+    scale: str
+    start: str
+    lists: str
+    machine: str
+
+
+class RunReader:
+    """Reads every file of finished runs once.
+
+    Attributes:
+        by_seed: the runs that a row of a table may be, by seed and key.
+        seeds: the seeds of every experiment.
+        remarks: one sentence on each run that has no seed or no experiment.
+    """
+
+    def __init__(self, runs: Iterable[RunResult] = ()) -> None:
+        self.by_seed: dict[int, dict[str, RunResult]] = {}
+        self.seeds: dict[str, set[int]] = {}
+        self.remarks: list[str] = []
+        self._counts: dict[tuple[str, Words], Counts] = {}
+        self._origins: dict[str, Origin] = {}
+        for run in runs:
+            try:
+                tags = run.tags
+                seed, experiment = int(tags[SEED]), tags[EXPERIMENT]
+            except ODD as error:
+                self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
+                continue
+            self.by_seed.setdefault(seed, {})[run.key] = run
+            self.seeds.setdefault(experiment, set()).add(seed)
+
+    def __iter__(self) -> Iterator[RunResult]:
+        for runs in self.by_seed.values():
+            yield from runs.values()
+
+    def find(self, spec: RunSpec) -> RunResult | None:
+        """Return the run of a specification (`RunSpec.is_run`)."""
+        for run in self.by_seed[spec.seed].values():
+            if spec.is_run(run):
+                return run
+        return None
+
+    def counts(self, run: RunResult, words: Words) -> Counts:
+        """Return the counts of a measurement; InputError where they are missing or damaged."""
+        if (run.key, words) not in self._counts:
+            try:
+                self._counts[run.key, words] = counts_of(run, words)
+            except OSError as error:
+                raise InputError(f"run {run.key}: {error}") from error
+        return self._counts[run.key, words]
+
+    def has_counts(self, run: RunResult, words: Words) -> bool:
+        """Return whether a run has the counts of a measurement."""
+        return (run.key, words) in self._counts or stored_at(run, words) is not None
+
+    def origin(self, run: RunResult) -> Origin:
+        """Return what a run was made of, by its settings and its record."""
+        if run.key not in self._origins:
+            self._origins[run.key] = _origin_of(run)
+        return self._origins[run.key]
+
+
+def _origin_of(run: RunResult) -> Origin:
+    if not (run.folder / "config.yaml").is_file():
+        return Origin("unknown", "unknown", run.key, run.lists, run.machine)
+    settings = run.settings
+    scale = str(settings["scale"]["name"])
+    images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
+    weights = str(settings.get("pretrained") or settings["model"].get("weights") or "")
+    if weights.startswith("common:"):
+        is_one = settings["seeds"]["start"] == "common"
+    else:  # a file is the same for all seeds, an upstream run is one of its seed
+        is_one = bool(weights) and not weights.startswith("experiment:")
+    start = "0" if is_one else str(settings["seed"])
+    return Origin(images, scale, start, run.lists, run.machine)

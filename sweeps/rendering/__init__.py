@@ -1,1 +1,0 @@
-"""Formats of a scored table: terminal, Markdown, CSV, LaTeX, figure."""

@@ -1,1 +1,0 @@
-"""Pages of results, the report of a study, and records in MLflow."""

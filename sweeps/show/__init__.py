@@ -1,0 +1,1 @@
+"""Formats of a judged table: terminal, Markdown, CSV, LaTeX, figures, pages of results."""

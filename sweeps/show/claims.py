@@ -1,0 +1,273 @@
+"""Judged claims as one frame; terminal, Markdown, CSV and counts are views of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from rgbt.tables import ABSENT, TextTable, csv_text
+from sweeps.judge.judged_table import JudgedClaim
+from sweeps.show.table import plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WORDS = ("holds", "contradicted", "undecided", "not run")
+NOTES = (
+    "ours: mean over paired seeds, and its 95 % interval over images and seeds, of one seed over "
+    "images alone. would decide: what is needed for a difference as large as ours.",
+    "A verdict is about the direction and the bounds of a claim, not about a size in its words. "
+    "Each interval holds the truth in 95 % of cases by itself; of many claims without an effect, "
+    "2.5 % are called holding. With seeds far from normal (lognormal, sd 1 of the logarithm) 14 to "
+    "18 % of verdicts about no difference are wrong.",
+)
+# Word in the column of seeds for a difference of two evaluations without seeds.
+IMAGES = "images alone"
+
+COLUMNS = (
+    "table",
+    "paper",
+    "claim",
+    "source",
+    "says",
+    "remarks",
+    "verdict",
+    "contrast",
+    "printed",
+    "as_printed",
+    "margin",
+    "missing",
+    "reason",
+    "how",
+    "estimate",
+    "low",
+    "high",
+    "smallest",
+    "seeds_needed",
+    "seeds",
+    "starts",
+    "covers",
+    "warning",
+    "images",
+    "scale",
+    "start",
+)
+# Claims that differ in one of these are never in one grid.
+BASIS = ["images", "scale", "start", "how"]
+
+
+def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
+    """Return one claim a row; `how` names the form and overrides of all rows.
+
+    Returns:
+        the columns `COLUMNS`. as_printed is True, False or None (not printed), margin that of "does
+        as well as" (NaN of others), start and starts say from how many initial weights the seeds
+        began, warning also says whether lists or machines of the rows differ, and estimate to
+        seeds_needed, seeds and covers are those of `analysis.uncertainty.verdicts.Verdict`; NaN, 0
+        and "" without a verdict.
+    """
+    import pandas as pd
+
+    rows = []
+    for claim in judged:
+        rows.append({**_statement_columns(claim), "how": how, **_verdict_columns(claim)})
+    return pd.DataFrame(rows, columns=[*COLUMNS]).astype({"as_printed": object})
+
+
+def _statement_columns(judged: JudgedClaim) -> dict[str, Any]:
+    claim = judged.claim
+    is_similar = claim.expected == "similar" and claim.at_most is not None
+    return {
+        "table": judged.table,
+        "paper": judged.table.rpartition("/")[0] or "studies",
+        "claim": claim.name,
+        "source": claim.source,
+        "says": claim.says,
+        "remarks": claim.remarks,
+        "verdict": judged.word,
+        "contrast": judged.contrast,
+        "printed": math.nan if judged.printed is None else judged.printed,
+        "as_printed": judged.as_printed,
+        "margin": claim.at_most if is_similar else math.nan,
+        "missing": " | ".join(judged.missing),
+        "reason": judged.reason,
+    }
+
+
+def _verdict_columns(judged: JudgedClaim) -> dict[str, Any]:
+    verdict = judged.verdict
+    numbers = dict.fromkeys(("estimate", "low", "high", "smallest", "seeds_needed"), math.nan)
+    if verdict is None:
+        words = dict.fromkeys(("covers", "warning", "images", "scale", "start"), "")
+        return {**numbers, "seeds": 0, "starts": 0, **words}
+    numbers["estimate"] = verdict.estimate
+    numbers["smallest"] = verdict.smallest
+    numbers["seeds_needed"] = verdict.seeds_needed
+    if verdict.interval is not None:
+        numbers["low"], numbers["high"] = verdict.interval.low, verdict.interval.high
+    start = ""
+    if judged.scale:
+        is_one = judged.starts == 1 and verdict.seeds > 1
+        start = "one start for all seeds" if is_one else "a start for each seed"
+    warnings = [verdict.warning, *judged.warnings] if verdict.warning else judged.warnings
+    return {
+        **numbers,
+        "seeds": verdict.seeds,
+        "starts": min(verdict.seeds, judged.starts),
+        "covers": verdict.covers,
+        "warning": " ".join(warnings),
+        "images": judged.images,
+        "scale": judged.scale,
+        "start": start,
+    }
+
+
+def counted(frame: pd.DataFrame) -> str:
+    """Say how many claims there are by verdict, in a sentence."""
+    counts = frame["verdict"].value_counts()
+    parts = []
+    for word in WORDS:
+        if word in counts:
+            shown = "hold" if word == "holds" and counts[word] > 1 else word
+            parts.append(f"{counts[word]} {shown}")
+    return f"{len(frame)} claims: {', '.join(parts)}." if parts else "The table has no claims."
+
+
+def counts_grid(frame: pd.DataFrame) -> TextTable:
+    """Count the claims of every paper by verdict, and those with which its printed values agree."""
+    rows = []
+    for paper, claims in frame.groupby("paper", sort=True):
+        verdicts = [str((claims["verdict"] == word).sum()) for word in WORDS]
+        agreeing = sum(value is True for value in claims["as_printed"])
+        printed = sum(value is not None for value in claims["as_printed"])
+        rows.append((str(paper), *verdicts, f"{agreeing} of {printed}"))
+    return TextTable("", ("paper", *WORDS, "agree as printed"), tuple(rows))
+
+
+def basis_of(images: str, scale: str, start: str, how: str) -> str:
+    """Say what verdicts rest on: "synthetic images, scale=bench, a start for each seed"."""
+    return ", ".join(part for part in (f"{images} images", f"scale={scale}", start, how) if part)
+
+
+def claim_grids(frame: pd.DataFrame, *, noted: bool = False) -> list[TextTable]:
+    """Return the claims, one grid for each kind of images, scale and start.
+
+    Those that are decided come first. `noted`: with what the columns and a verdict mean.
+    """
+    order = frame["verdict"].map(WORDS.index).sort_values(kind="stable").index
+    header = ("verdict", "claim", "ours", "printed", "seeds", "would decide")
+    grids = []
+    for basis, claims in frame.loc[order].groupby(BASIS, sort=False):
+        is_run = bool(basis[1])
+        title = counted(claims)
+        if is_run:
+            title += f" {basis_of(*basis).capitalize()}."
+        rows = [_grid_row(row) for _, row in claims.iterrows()]
+        notes = [warning for warning in claims["warning"].unique() if warning]
+        if noted and is_run:
+            notes += NOTES
+        grids.append(TextTable(title, header, tuple(rows), tuple(notes)))
+    return grids
+
+
+def _grid_row(row: pd.Series) -> tuple[str, ...]:
+    table = row["table"].rpartition("/")[2]
+    ours = _signed(row["estimate"])
+    if not math.isnan(row["low"]):
+        ours += f" {_interval(row)}"
+    return (
+        row["verdict"],
+        f"{row['says']} ({table}: {row['contrast']})",
+        ours,
+        _signed(row["printed"]),
+        _seeds(row),
+        _would_decide(row),
+    )
+
+
+def _interval(row: pd.Series) -> str:
+    """The interval as text."""
+    return ABSENT if math.isnan(row["low"]) else f"[{_signed(row['low'])}, {_signed(row['high'])}]"
+
+
+def _seeds(row: pd.Series) -> str:
+    """The number of paired seeds, or that there are none."""
+    return IMAGES if row["covers"] == "images" and not row["seeds"] else str(row["seeds"])
+
+
+def _would_decide(row: pd.Series) -> str:
+    """What an undecided claim needs."""
+    needed = float(row["seeds_needed"])
+    if row["verdict"] != "undecided":
+        return ABSENT
+    if row["missing"]:
+        return "more rows"
+    if math.isnan(needed):
+        return "a second seed" if row["seeds"] == 1 else "more images"
+    return "more images" if math.isinf(needed) else f"{needed:.0f} seeds"
+
+
+def _signed(value: float) -> str:
+    return ABSENT if math.isnan(value) else f"{value:+.2f}"
+
+
+def statement(row: pd.Series) -> str:
+    """Return a claim with its verdict, its numbers and what these rest on, as Markdown."""
+    if row["verdict"] == "not run":
+        return f"{row['says']} **Not run.**"
+    text = f"{row['says']} **{row['verdict'].capitalize()}**: {row['contrast']} "
+    text += f"{_signed(row['estimate'])} {_interval(row)}"
+    if row["scale"]:
+        seeds = _seeds(row)
+        seeds = seeds if seeds == IMAGES else f"{seeds} seeds"
+        text += f" ({basis_of(*row[BASIS])}, {seeds})"
+    text += "."
+    if not math.isnan(row["margin"]):
+        text += f" Alike means within {row['margin']:g}."
+    if row["warning"]:
+        text += f" {row['warning']}"
+    return text
+
+
+def claim_lines(frame: pd.DataFrame) -> list[str]:
+    """Return every claim as an item of a Markdown list, with printed values and its reason."""
+    words = {True: "agree", False: "do not agree", None: "do not tell"}
+    lines = []
+    for _, row in frame.iterrows():
+        line = f"- `{row['claim']}`: {statement(row)} ({row['source']})"
+        if row["verdict"] == "not run":
+            lines.append(line)
+            continue
+        line += f" The printed values {words[row['as_printed']]}"
+        if not math.isnan(row["printed"]):
+            line += f" ({row['printed']:+.2f})"
+        line += "."
+        if row["reason"]:
+            line += f" {row['reason'][:1].upper()}{row['reason'][1:]}"
+        lines.append(line)
+        lines += [f"    - {remark}" for remark in row["remarks"]]
+    return lines
+
+
+def claims_markdown(frame: pd.DataFrame) -> str:
+    """Return tables of the judged claims, then every claim with its place and its reason."""
+    grids = "\n".join(grid.to_markdown() for grid in claim_grids(frame))
+    lines = [*claim_lines(frame), ""]
+    return "\n".join([grids, *lines] if grids else lines)
+
+
+def frame_csv(frame: pd.DataFrame) -> str:
+    """Return a frame as CSV; empty where there is no value."""
+    rows: list[list[object]] = [list(frame.columns)]
+    for values in frame.itertuples(index=False):
+        row: list[object] = []
+        for value in values:
+            if isinstance(value, tuple):
+                row.append("; ".join(value))
+            elif isinstance(value, float):
+                row.append(plain(value))
+            else:
+                row.append("" if value is None else value)
+        rows.append(row)
+    return csv_text(rows)

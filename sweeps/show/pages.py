@@ -1,0 +1,262 @@
+"""Pages of results from finished runs: Markdown by one template, and one HTML file of the same."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import tempfile
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from rich.console import Console
+from rich.progress import track
+
+from analysis.results import finished_runs
+from rgbt.checks import InputError
+from rgbt.config.options import readable_paths
+from rgbt.files.yaml_files import read_yaml
+from rgbt.runs.provenance import without_passwords
+from rgbt.tables import number
+from sweeps.judge.reader import RunReader
+from sweeps.judge.stored_tables import judged_tables, known_tables
+from sweeps.plan.planner import Planner
+from sweeps.show.claims import counts_grid, statement
+from sweeps.show.sections import (
+    STUDIES,
+    TableSection,
+    claims_of,
+    markdown,
+    networks_section,
+    paper_section,
+    runs_section,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TEMPLATES = Path(__file__).with_name("templates")
+# Scales in the order in which their verdicts count more.
+SCALES = ("smoke", "demo", "bench", "paper")
+
+# A path from the root of a machine; addresses of pages and relative paths do not match.
+ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
+
+# Beginning of markup that is not ours, such as an element in a text of a run.
+MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
+
+# Numbers in a page written by hand, between two comments.
+MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL)
+
+FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
+
+
+class Report:
+    """Everything that the pages show, computed once from the runs of a folder and an archive.
+
+    Args:
+        resamples: of the images, for the intervals.
+        counted: with sizes of networks, which needs torch.
+
+    Attributes:
+        runs: all finished runs; `reader` has those that a table may have.
+        tables: a section for every table, in every way that it was run.
+        every: their claims; `claims` has each claim once.
+        remarks: what cannot be read or composed, one sentence each.
+    """
+
+    def __init__(self, runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -> None:
+        self.texts = read_yaml(TEMPLATES / "pages.yaml")
+        self.runs = finished_runs(runs_dir, archive)
+        self.reader = RunReader(self.runs)
+        self.remarks: list[str] = []
+        known = known_tables(self.remarks)
+        self.remarks += self.reader.remarks
+        planner = Planner(readable_paths([f"runs_dir={runs_dir}"]))
+        judged = judged_tables(
+            self.reader, planner, known, self.remarks, resamples=resamples, counted=counted
+        )
+        bar = track(list(judged), "tables", console=Console(stderr=True))
+        self.tables = [TableSection(table) for table in bar]
+        self.every = claims_of(self.tables)
+        self.claims = self._decisive_claims()
+        self.data = runs_section(self.runs, self.reader, self.remarks)
+        self.papers = self._papers()
+        self.studies: dict[str, str] = {}
+        for path in sorted(runs_dir.glob("studies/*/study.md")):
+            self.studies[path.parent.name] = path.read_text(errors="replace")
+
+    def _decisive_claims(self) -> pd.DataFrame:
+        """Every claim once: its verdict by the most seeds at the largest scale counts."""
+        ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
+        ranked = self.every.assign(rank=ranks.fillna(-1))
+        order = ranked.sort_values(["rank", "seeds"], kind="stable")
+        return order.drop_duplicates(["table", "claim"], keep="last").sort_index()
+
+    def _papers(self) -> list[dict[str, Any]]:
+        """The pages of tables: those of the papers, of our studies, then of the user."""
+        known = {}
+        for name, paper in self.texts["papers"].items():
+            known[name] = (paper["title"], paper["reference"])
+        known[STUDIES] = ("Studies", "Tables of this project that no paper prints.")
+        for table in self.tables:
+            known.setdefault(table.page, (table.page, "Tables of the user."))
+        return [
+            paper_section(name, title, reference, self.tables)
+            for name, (title, reference) in known.items()
+        ]
+
+    @property
+    def limits(self) -> list[str]:
+        """What the verdicts do not say, one sentence or two each."""
+        judged = self.every[self.every["verdict"] != "not run"]
+        sentences = []
+        if "paper" not in set(judged["scale"]):
+            sentences.append(
+                "**Networks:** no verdict is at paper scale. Small networks on small images say "
+                "something about a method at that scale, and neither confirm nor refute a number."
+            )
+        for column, word, text in (
+            ("images", "synthetic", "is on synthetic scenes: what these lack, it cannot show"),
+            ("start", "one start for all seeds", "is from one start, see the warning beside it"),
+            ("covers", "images", "is of one training: other trainings are not covered"),
+        ):
+            count = int((judged[column] == word).sum())
+            if count:
+                name = column.capitalize()
+                sentences.append(f"**{name}:** the verdict of {count} claims {text}.")
+        chance = f"**Chance:** of {len(judged)} claims without any effect, up to"
+        return [*sentences, f"{chance} {0.025 * len(judged):.1f} would be called holding."]
+
+    def page(self, name: str) -> str:
+        """Return a page as Markdown: "index", "claims", "networks", "all" or name of a paper."""
+        environment = Environment(
+            loader=FileSystemLoader(TEMPLATES),
+            autoescape=False,  # Markdown; `MARKUP` makes plain what looks like an element
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        own, of_papers = [], []
+        for table in self.tables:
+            is_of_paper = table.page in self.texts["papers"] and not table.is_run
+            (of_papers if is_of_paper else own).append(table)
+        data = {
+            **self.data,
+            "num_runs": len(self.runs),
+            "at_paper_scale": any("scale=paper" in grid for grid in self.data["runs"]),
+            "remarks": self.remarks,
+            "counts": markdown(counts_grid(self.claims)),
+            "papers": self.papers,
+            "limits": self.limits,
+            "own": [table for table in own if table.is_run or table.page != STUDIES],
+            "papers_tables": of_papers,
+            "studies": self.studies.items(),
+            "any_verdict": bool((self.claims["verdict"] != "not run").any()),
+        }
+        if name == "networks":
+            data |= networks_section(self.texts["networks"])
+        papers = {paper["name"]: paper for paper in self.papers}
+        template = environment.get_template("pages.md.j2")
+        text = template.render(data=data, page=name, paper=papers.get(name))
+        text = re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+        return MARKUP.sub("&lt;", ABSOLUTE.sub(r".../\1", without_passwords(text)))
+
+    def pages(self) -> dict[str, str]:
+        """Return every page of ``docs/results`` by its file; those of a user's tables too."""
+        names = ["index", "claims", "networks", *(paper["name"] for paper in self.papers)]
+        return {f"{name}.md": self.page(name) for name in names}
+
+    def html(self) -> str:
+        """Return all of it as one file, which loads nothing and runs only its own script."""
+        from markdown_it import MarkdownIt
+
+        text = re.sub(r"<!--.*?-->\n", "", self.page("all"))
+        reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+        body = ""
+        for place, part in enumerate(FOLDED.split(text)):  # every second part is a tag
+            body += part if place % 2 else reader.render(part)
+        body = body.replace("<table>", '<div class="scroll"><table>')
+        body = body.replace("</table>", "</table></div>")
+        for name, content in self.images.items():
+            address = f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
+            body = body.replace(f'src="{name}"', f'src="{address}"')
+        script = (TEMPLATES / "sort.js").read_text()
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        shell = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
+        page = shell.get_template("page.html.j2")
+        return page.render(body=body, script=script, hash=f"sha256-{digest}")
+
+    @cached_property  # a second drawing has another layout
+    def images(self) -> dict[str, bytes]:
+        """The figures of the pages that were made, as SVG by the names of their files."""
+        from analysis.figures.plots import save
+
+        with tempfile.TemporaryDirectory() as folder:
+            for table in self.tables:
+                if table.drawn is not None:
+                    save(table.drawn, Path(folder, table.figure))
+            return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+    def filled(self, text: str) -> str:
+        """Return a page written by hand with its marked numbers made again.
+
+        Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
+        the papers and ``count runs`` that of runs, ``cell TABLE COLUMN ROW`` a mean over seeds with
+        its standard deviation, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
+        InputError: a mark that names nothing.
+        """
+        return MARKED.sub(lambda mark: f"{mark[1]}{self._number(mark[2])}{mark[3]}", text)
+
+    def _number(self, mark: str) -> str:
+        """What a mark names."""
+        if mark == "count runs":
+            return str(len(self.runs))
+        if mark == "count":
+            return str(int(self.claims["table"].str.contains("/").sum()))
+        kind, _, rest = mark.partition(" ")
+        name, _, rest = rest.partition(" ")
+        text = None
+        tables = [table for table in self.tables if table.judged.request.name == name]
+        if kind == "claim":
+            text = self._claim(name, rest)
+        elif kind == "cell" and tables:
+            text = _cell(tables[0], rest)
+        elif kind == "effects" and tables:
+            text = _effects(tables[0], rest)
+        if text is None:
+            raise InputError(f"<!-- results:{mark} --> names no claim, design or number.")
+        return text
+
+    def _claim(self, table: str, name: str) -> str | None:
+        """A claim with its verdict, or with the command that runs it."""
+        found = self.claims[(self.claims["table"] == table) & (self.claims["claim"] == name)]
+        if found.empty:
+            return None
+        text = statement(found.iloc[0])
+        if found.iloc[0]["verdict"] == "not run":
+            text += f" (`rgbt reproduce table={table} scale=bench seeds=4`)"
+        return text
+
+
+def _cell(table: TableSection, text: str) -> str | None:
+    """A mean over seeds with its standard deviation; `text` is the column, then the row."""
+    column, _, row = text.partition(" ")
+    cell = table.judged.scored.cells.get((row, column))
+    return None if cell is None else f"{number(cell.mean)} ± {number(cell.sd)}"
+
+
+def _effects(table: TableSection, outcome: str) -> str | None:
+    """The figure and the effects of a design on an outcome, or the command that runs it."""
+    request = table.judged.request
+    if request.table.design is None:
+        return None
+    texts = [grid for grid in table.grids if f"Effects on {outcome}," in grid]
+    if table.figure:
+        texts.insert(0, f"![{table.title}]({table.figure})")
+    if not texts:
+        words = "rows=tested scale=bench seeds=3"
+        texts.append(f"No run yet: `rgbt reproduce table={request.name} {words}`.")
+    return "\n\n" + "\n\n".join(texts) + "\n\n"

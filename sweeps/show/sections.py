@@ -1,0 +1,234 @@
+"""Parts of the pages of results as Markdown: tables, papers, runs, networks."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, one_line
+from rgbt.metrics import names
+from rgbt.metrics.named import value
+from rgbt.runs.folder import GROUP
+from rgbt.runs.provenance import commit_of
+from rgbt.runs.result import RunResult
+from rgbt.tables import ABSENT, TextTable, number
+from sweeps.judge.effects import effects_of
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.judge.reader import SEED, RunReader
+from sweeps.plan.request import DEFAULT_SCALE, TAG
+from sweeps.run.progress import duration
+from sweeps.score.efficiency import million_parameters
+from sweeps.show.claims import claim_grids, claim_lines, claims_frame, counted
+from sweeps.show.effects import effects_grids
+from sweeps.show.publish import drawn_of, grid_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+STUDIES = "studies"
+METRICS = (names.MIOU, names.VAR)
+PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
+# Errors that a record may raise that somebody has edited.
+ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
+
+
+class TableSection:
+    """A judged table as a section of a page; texts are Markdown.
+
+    Attributes:
+        page: the folder of its file; all studies of ours have one.
+        is_run: whether it has a finished run.
+        frame: its claims (`claims_frame`), `counted` by verdict in a sentence, and as `claims`.
+        grids: the table, then the effects of its design.
+        drawn: its figure, and `figure` the name of its file; None, and "", without one.
+        command: what runs it.
+    """
+
+    def __init__(self, judged: JudgedTable) -> None:
+        request = judged.request
+        folder, slash, _ = request.name.partition("/")
+        self.judged, self.is_run = judged, bool(judged.runs)
+        self.page = folder if slash else STUDIES
+        form = "released form" if request.form == "released" else ""
+        words = shlex.join(request.extra)
+        self.title = request.table.number if slash else request.name
+        if self.is_run:
+            self.title += f" ({_joined(f'scale={request.scale}', form, words)})"
+        self.caption = request.table.caption.rstrip(".") + "."
+        self.frame = claims_frame(judged.claims, _joined(form, words))
+        self.counted = counted(self.frame)
+        self.claims = "\n".join(claim_lines(self.frame))
+        self.command = _command_of(judged)
+        self.grids: list[str] = []
+        self.drawn: Figure | None = None
+        self.figure = ""
+        if self.is_run:
+            self._show(*effects_of(judged))
+
+    def _show(self, effects: pd.DataFrame, lacking: Sequence[str]) -> None:
+        """Set the grids and the figure of a table that was run."""
+        judged, request = self.judged, self.judged.request
+        grids = [replace(grid_of(judged, "markdown"), title="")]
+        if request.table.design is not None:
+            grids += effects_grids(effects, lacking, request.table.design)
+        self.grids = [markdown(grid) for grid in grids]
+        if len({label for label, _ in judged.runs}) > 1:  # one row compares nothing
+            self.drawn = drawn_of(judged, effects)
+        if self.drawn is not None:
+            self.figure = f"{request.name.replace('/', '-')}_{request.variant}.svg"
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+def _command_of(judged: JudgedTable) -> str:
+    """The command that runs what a table lacks."""
+    request, seeds = judged.request, judged.scored.seeds
+    typed = "3"
+    if seeds:
+        is_first = seeds == tuple(range(len(seeds)))
+        typed = str(len(seeds)) if is_first else ",".join(map(str, seeds))
+    words = [f"table={request.name}", f"seeds={typed}"]
+    if request.scale != DEFAULT_SCALE:
+        words.append(f"scale={request.scale}")
+    if request.form != "paper":
+        words.append(f"form={request.form}")
+    return shlex.join(["rgbt", "reproduce", *words, *request.extra])
+
+
+def paper_section(
+    name: str, title: str, reference: str, tables: Sequence[TableSection]
+) -> dict[str, Any]:
+    """Return what the template shows of a page of tables: of a paper, of ours, or of the user."""
+    own = [table for table in tables if table.page == name]
+    frame = claims_of(own)
+    is_run = frame["verdict"] != "not run"
+    of_tables = frame["table"].str.split("/").str[-1]
+    lines = "- " + of_tables + ", `" + frame["claim"] + "`: " + frame["says"]
+    return {
+        "name": name,
+        "title": title,
+        "reference": reference,
+        "tables": own,
+        "counted": counted(frame),
+        "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
+        "not_run": "\n".join(lines[~is_run]),
+    }
+
+
+def markdown(grid: TextTable) -> str:
+    """Return a grid in Markdown; "" for one without rows."""
+    return grid.to_markdown().rstrip() if grid.rows else ""
+
+
+def claims_of(tables: Sequence[TableSection]) -> pd.DataFrame:
+    """Return the claims of all these tables, once for every way that they were run."""
+    import pandas as pd
+
+    frames = [table.frame for table in tables if len(table.frame)]
+    return pd.concat(frames, ignore_index=True) if frames else claims_frame(())
+
+
+def runs_section(
+    runs: Sequence[RunResult], reader: RunReader, remarks: list[str]
+) -> dict[str, Any]:
+    """Return the runs by method and where they come from; a damaged one becomes a remark.
+
+    Returns:
+        "runs": one grid for each kind of images and scale; "origin": the versions and machines.
+    """
+    import pandas as pd
+
+    rows, facts = [], []
+    for run in runs:
+        try:
+            row, origin = _scores(run, reader), _origin(run)
+        except ODD as error:
+            remarks.append(f"Run {run.key} is left out: {one_line(error)}.")
+        else:
+            rows.append(row)
+            facts.append(origin)
+    if not rows:
+        return {"runs": [], "origin": ""}
+    grids = []
+    for (images, scale), kind in pd.DataFrame(rows).groupby(["images", "scale"]):
+        grids.append(_runs_of_kind(str(images), str(scale), kind))
+    lines = []
+    for name, column in pd.DataFrame(facts).items():
+        texts = sorted(set(column.dropna()) - {""})
+        lines.append((str(name), ", ".join(texts) or ABSENT))
+    return {"runs": grids, "origin": markdown(TextTable("", ("what", "value"), tuple(lines)))}
+
+
+def _scores(run: RunResult, reader: RunReader) -> dict[str, Any]:
+    """The method, seed, scores, time and tables of a run."""
+    tags, counts, origin = run.tags, reader.counts(run, ()), reader.origin(run)
+    tables = [tag.removeprefix(TAG) for tag in tags if tag.startswith(TAG)]
+    return {
+        "method": tags.get(GROUP, run.key),
+        "dataset": counts.dataset,
+        "images": origin.images,
+        "scale": origin.scale,
+        "seed": int(tags[SEED]),
+        **{name: value(name, counts, counts.absent) for name in METRICS},
+        "time": float(run.result["seconds_of_last_process"]),
+        "tables": sorted(tables),
+    }
+
+
+def _origin(run: RunResult) -> dict[str, str | None]:
+    """The code, the versions and the machine of a run."""
+    first = next(iter(run.provenance), {})
+    packages, gpus = first.get("packages") or {}, ", ".join(first.get("gpus") or [])
+    return {
+        "git commit": commit_of(first),
+        "Python": first.get("python"),
+        **{name: packages.get(name) for name in PACKAGES},
+        "hardware": gpus or f"{first['cpu']}, {first['cpu_usable']} cores",
+    }
+
+
+def _runs_of_kind(images: str, scale: str, runs: pd.DataFrame) -> str:
+    """The runs on one kind of images at one scale, a line for each method and data set."""
+    methods = [method.split() for method in runs["method"]]
+    shared = [word for word in methods[0][1:] if all(word in words for words in methods)]
+    lines = []
+    for (method, _), group in runs.groupby(["method", "dataset"]):
+        own = " ".join(word for word in method.split() if word not in shared)
+        seeds = ", ".join(map(str, sorted(group["seed"])))
+        scores = []
+        for name in METRICS:
+            spread = f" ± {number(group[name].std())}" if len(group) > 1 else ""
+            scores.append(f"{number(group[name].mean())}{spread}")
+        tables = dict.fromkeys(group["tables"].explode().dropna())
+        time = duration(group["time"].median())
+        lines.append((f"`{own}`", seeds, *scores, time, "; ".join(tables)))
+    header = ("method", "seeds", *METRICS, "time", "rows of")
+    hours = duration(runs["time"].sum())
+    title = f"{len(runs)} runs on {images} images, scale={scale}, {hours} in all"
+    grid = markdown(TextTable(title, header, tuple(lines)))
+    common = " ".join(word for word in shared if word != f"scale={scale}")
+    return f"{grid}\n\nAll of them with `{common}`." if common else grid
+
+
+def networks_section(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the grids of the page of networks, which are built without memory to be counted."""
+    sizes, weights, tests = [], [], []
+    for network in networks:
+        name = network["name"]
+        for model in network["models"]:
+            words = (*network.get("overrides", ()), *f"model={model}".split())
+            sizes.append((name, f"`model={model}`", f"{million_parameters(words):.2f}"))
+        for file, address in network["weights"]:
+            weights.append((name, file, f"<{address}>"))
+        tests.append((name, ", ".join(f"`{test}`" for test in network["tests"])))
+    header = ("network", "configuration", "million parameters")
+    return {
+        "networks": markdown(TextTable("", header, tuple(sizes))),
+        "weights": markdown(TextTable("", ("network", "file", "published at"), tuple(weights))),
+        "tests": markdown(TextTable("", ("network", "test"), tuple(tests))),
+    }
