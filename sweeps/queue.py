@@ -89,17 +89,19 @@ class Queue:
 
     def _note_finished(self, outcomes: Sequence[Outcome]) -> None:
         """Archive the runs of newly finished points, and note how long they took."""
+        archive = None if self.is_dry else self.runs.archive
+        seen, self._seen = self._seen, set()
         for place, outcome in enumerate(outcomes):
-            if outcome.state != "finished" or place in self._seen:
+            if outcome.state != "finished":
+                continue
+            self._seen.add(place)
+            if place in seen:
                 continue
             for result in outcome.results:
-                is_kept = self.runs.archive is not None and not self.is_dry
-                if is_kept and self.runs.is_own(result):
-                    add(result, self.runs.archive)
+                if archive is not None and self.runs.is_own(result):
+                    add(result, archive)
             if outcome.seconds is not None:
                 self._seconds[self._network(outcome.point)].append(outcome.seconds)
-        finished = (n for n, outcome in enumerate(outcomes) if outcome.state == "finished")
-        self._seen = set(finished)
 
     def _count(
         self, seeds: SeedsUntilDecided, outcomes: Sequence[Outcome], missing: list[Point]

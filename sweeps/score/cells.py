@@ -122,9 +122,11 @@ def _row_cells(
     cells = {}
     for column in filter(is_of_runs, table.columns_of(row)):
         values = {seed: found[column.name] for seed, found in by_seed.items()}
-        missing = [outcomes[seed].state for seed, found in values.items() if isinstance(found, str)]
-        mark = missing[0] if missing else ""
-        mark = NO_VALUE if mark == "finished" else mark
+        mark = ""
+        for seed, found in values.items():
+            if isinstance(found, str) and not mark:
+                state = outcomes[seed].state
+                mark = NO_VALUE if state == "finished" else state
         cells[row.label, column.name] = over_seeds(values, mark, keys)
     return cells
 

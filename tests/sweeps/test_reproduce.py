@@ -52,7 +52,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
         def work(wanted: PointList, settings: SweepSettings) -> Sequence[Outcome]:
             asked.append((wanted, settings))
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
-            return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
+            return [_outcome(*known) for known in zip(wanted.points, turns, range(99))]
 
         monkeypatch.setattr(point_list, "run_points", work)
         monkeypatch.setattr(point_list, "preview_points", work)

@@ -89,14 +89,14 @@ def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> 
     assert command_of(worlds[1]) == ("rgbt.evaluate", *worlds[1])
     assert len(set(worlds)) == 4
     ring = replace(request, table=replace(table, regions="ring9"))
-    (point,) = (each for each in ring.points() if each.label == "crm natural seed=0")
+    (point,) = (point for point in ring.points() if point.label == "crm natural seed=0")
     assert point.evaluations[2:] == tuple(("regions=ring9", *words) for words in worlds[1:])
 
 
 def design(generators: dict[str, str], letters: str = "OCNS") -> Design:
     factors = tuple(
-        DesignFactor(letter=each, name=each.lower(), low_means="", high_means="")
-        for each in letters
+        DesignFactor(letter=letter, name=letter.lower(), low_means="", high_means="")
+        for letter in letters
     )
     part, methods = Part(generators=generators), (DesignMethod(name="m", experiment="crm"),)
     return Design(factors=factors, methods=methods, outcomes=("mIoU",), trained=part)
@@ -165,7 +165,7 @@ def test_study_of_the_spatial_bias_has_its_cells() -> None:
         g = float(values[gain])
         return float(values[key]) ** 2 * (1 + 2 * g / 3 + fourth * g**2)
 
-    by_letter = {each.letter: each for each in made.factors}
+    by_letter = {factor.letter: factor for factor in made.factors}
     for letter, key, gain in (
         ("C", "texture_strength", "texture_radius_gain"),
         ("N", "rgb_noise", "rgb_noise_radius_gain"),

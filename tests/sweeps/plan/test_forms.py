@@ -355,7 +355,7 @@ def test_rows_printed_twice_are_one_run(scale: str) -> None:
     for cells in TWICE:
         keys, printed = set(), set()
         for name, _, label in (cell.partition(" ") for cell in cells.split(" | ")):
-            (row,) = (each for each in TABLES[name].rows if each.label == label)
+            (row,) = (row for row in TABLES[name].rows if row.label == label)
             keys.add(run_of(TABLES[name], row, "paper", scale).key)
             value = next(row.values[key] for key in MAIN if row.values.get(key) is not None)
             assert value is not None
@@ -365,7 +365,7 @@ def test_rows_printed_twice_are_one_run(scale: str) -> None:
 
 def upstream_names(run: RunSpec) -> set[str]:
     """Names of all upstream runs, those of upstream runs included."""
-    return {each.name for each in run.upstream}.union(*map(upstream_names, run.upstream))
+    return {other.name for other in run.upstream}.union(*map(upstream_names, run.upstream))
 
 
 def test_upstream_runs_of_released_rows_are_released() -> None:
@@ -401,10 +401,12 @@ STARRED = {
 @pytest.mark.parametrize(("name", "label"), STARRED)
 def test_released_starred_rows_train_basic_network_in_two_stages(name: str, label: str) -> None:
     """The scripts import the basic network; the modified decoder is that of the paper's form."""
-    (row,) = (each for each in TABLES[name].rows if each.label == label)
+    (row,) = (row for row in TABLES[name].rows if row.label == label)
     paper, second = (run_of(TABLES[name], row, form, "paper") for form in FORMS)
     assert paper.model.plain["decoder"] == "modified_heatnet"
-    (first,) = (each.run for each in second.dependencies if each.key == "model.weights")
+    (first,) = (
+        dependency.run for dependency in second.dependencies if dependency.key == "model.weights"
+    )
     for run, sizes, gradients in zip(
         (first, second), STARRED[name, label], ("kept", "together"), strict=True
     ):

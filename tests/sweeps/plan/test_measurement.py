@@ -115,11 +115,11 @@ def stored(folder: Path, **measured: Measurement) -> RunResult:
     run = RunResult(finish(folder, dataset=BASE.dataset).path)
     (run.folder / "evaluations").mkdir()
     own = run.counts()
-    files = {OWN: BASE} | {f"evaluations/{name}.npz": each for name, each in measured.items()}
-    for path, each in files.items():
-        rows = number_of_regions(each.partition) or 3
+    files = {OWN: BASE} | {f"evaluations/{name}.npz": found for name, found in measured.items()}
+    for path, found in files.items():
+        rows = number_of_regions(found.partition) or 3
         whole = np.repeat(own.counts, rows, axis=1)
-        replace(own, counts=whole, measurement=each).save(run.folder / path)
+        replace(own, counts=whole, measurement=found).save(run.folder / path)
     return run
 
 
@@ -180,7 +180,9 @@ def test_images_of_another_world_are_known_by_its_words(tmp_path: Path) -> None:
 
 def test_pairs_are_found_by_their_protocol(tmp_path: Path) -> None:
     made = ("aligned3-0123abcd", "aligned5", "released5", "next1-0123abcd")
-    run = stored(tmp_path / "run", **{each: replace(BASE, partition=each) for each in made})
+    run = stored(
+        tmp_path / "run", **{partition: replace(BASE, partition=partition) for partition in made}
+    )
     for protocol, name in zip(("aligned", "released", "next"), made[1:], strict=True):
         assert stored_at(run, (f"frames={protocol}",)) == f"evaluations/{name}.npz"
     (run.folder / "evaluations" / "aligned5.npz").unlink()

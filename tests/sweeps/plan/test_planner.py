@@ -50,7 +50,7 @@ def test_plan_key_hashes_runs_and_evaluations(planner: Planner) -> None:
     plan = planner.plan(Point("p", (), seeds=(0, 1)))
     runs = [planner.plan(Point("p", (f"seed={seed}",))).key for seed in (0, 1)]
     assert [run.key for run in plan.runs] == runs
-    keys = {planner.plan(Point("p", (), evaluations=(each,))).key for each in EVALUATIONS}
+    keys = {planner.plan(Point("p", (), evaluations=(words,))).key for words in EVALUATIONS}
     assert len({*runs, plan.key, *keys}) == 3 + len(EVALUATIONS)
     same = planner.plan(Point("q", (), evaluations=((*EVALUATIONS[0],),))).key
     assert same in keys

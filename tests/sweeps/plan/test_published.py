@@ -108,7 +108,7 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
     for name, table in OURS.items():
         for claim in table.claims:
             values = printed_values(table)
-            printed = [each.of_values(values) for each in contrasts_of(claim, table)]
+            printed = [contrast.of_values(values) for contrast in contrasts_of(claim, table)]
             found[f"{name} {claim.name}"] = as_claimed(claim, printed)
             sizes = [round(abs(value), 1) for value in printed if value is not None]
             for size in re.findall(r"(?:has|gains?) (\d+\.\d)", claim.says):
@@ -117,6 +117,6 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
                 assert any(f"{claim.at_most:g}" in remark for remark in claim.remarks), claim.name
             if name[0] in "cs" and found[f"{name} {claim.name}"] is False:
                 assert any("printed" in remark for remark in claim.remarks), claim.name
-    listed = {each.strip(): False for each in CONTRADICTED.split(",")}
-    listed |= {each.strip(): None for each in NOT_PRINTED.split(",")}
+    listed = {name.strip(): False for name in CONTRADICTED.split(",")}
+    listed |= {name.strip(): None for name in NOT_PRINTED.split(",")}
     assert {key: word for key, word in found.items() if word is not True} == listed

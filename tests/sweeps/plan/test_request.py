@@ -124,11 +124,11 @@ def test_form_and_rows_make_another_table() -> None:
     released = replace(plain, form="released")
     chosen = ((plain, ""), (plain, "Ny/4,Ny/8"), (released, ""))
     made = [make_request(request, rows) for request, rows in chosen]
-    variants = [each.variant for each in made]
+    variants = [request.variant for request in made]
     assert variants[0] == "demo"
     assert variants[1].startswith("demo-")
     assert variants[2] == "demo-released"
-    assert [len(each.points()) for each in made] == [7, 2, 7]
+    assert [len(request.points()) for request in made] == [7, 2, 7]
     assert made[0].overrides("Ny/4", 0)[0] == "+experiment=grbm"
     assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
 
@@ -173,7 +173,7 @@ def test_selected_rows_keep_their_claims() -> None:
     made = table(rows, claims=(*claims, claim("best", ("c",), ("others",))))
     chosen = select_rows(made, "c,1")
     assert [row.label for row in chosen.rows] == ["a", "c"]
-    assert [each.name for each in chosen.claims] == ["c_a"]
+    assert [claim.name for claim in chosen.claims] == ["c_a"]
     assert select_rows(made, "b").rows[0].same_as is None
     assert select_rows(made, "a,b,c").claims == made.claims
 
@@ -194,7 +194,7 @@ def test_twins_of_a_row_left_out_stay_declared() -> None:
 
 
 def test_undeclared_rows_of_one_run_are_refused() -> None:
-    first, third = (Row(label=each, experiment="baseline") for each in "ac")
+    first, third = (Row(label=label, experiment="baseline") for label in "ac")
     same = Row(label="b", experiment="baseline", same_as="a")
     with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):
         check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())

@@ -46,13 +46,13 @@ def test_self_training_is_compared_at_equal_steps_and_start(task: str) -> None:
     first = specs.pop("Source only")
     assert specs.pop("Two heads").upstream
     assert len(specs) == 8
-    assert {each.plain["trainer"]["max_steps"] for each in specs.values()} == {160}
+    assert {spec.plain["trainer"]["max_steps"] for spec in specs.values()} == {160}
     for spec in specs.values():
-        assert [each.key for each in spec.upstream] == [first.key]
+        assert [run.key for run in spec.upstream] == [first.key]
         assert spec.plain["optimizer"] == first.plain["optimizer"]
         assert spec.plain["data"]["batch_size"] == first.plain["data"]["batch_size"]
     schemes = [spec.plain["scheme"]["_target_"].rpartition(".")[2] for spec in specs.values()]
     assert schemes == ["Supervised", "Adversarial", *["SelfTraining"] * 6]
     views = {label: spec.plain["domains"]["target"] for label, spec in specs.items()}
     view = {"night": "rgb", "thermal": "thermal"}[task]
-    assert {each["view"] for each in views.values() if each is not None} == {view}
+    assert {target["view"] for target in views.values() if target is not None} == {view}

@@ -118,7 +118,7 @@ def test_score_sizes_have_marks_without_seeds() -> None:
 
     def marks(*millions: float) -> dict[str, int]:
         pairs = zip("abc", millions, strict=True)
-        cells = {(label, "size"): TableCell(each, math.nan, 0) for label, each in pairs}
+        cells = {(label, "size"): TableCell(million, math.nan, 0) for label, million in pairs}
         found = score("t", table(rows, (ACC, size)), BOTH, scale="demo", sizes=cells)
         assert found.cells["b", "size"].mean == millions[1]
         return {label: rank for (label, _), rank in size_marks(found.table, cells).items()}
@@ -143,8 +143,10 @@ class Uncounted(FakeResult):
 
 def test_runs_without_counts_share_a_reason() -> None:
     every: Any = [Uncounted(key, {}, folder=Path(key)) for key in "kl"]
-    points = [Outcome(Point(each.key, ()), "finished", results=(each,)) for each in every]
-    cell = scored((ACC,), {("a", seed): each for seed, each in enumerate(points)}).cells["a", "acc"]
+    points = [Outcome(Point(result.key, ()), "finished", results=(result,)) for result in every]
+    cell = scored((ACC,), {("a", seed): outcome for seed, outcome in enumerate(points)}).cells[
+        "a", "acc"
+    ]
     assert cell.reason == f"seeds 0, 1: {OWN} does not exist"
 
 
