@@ -76,7 +76,6 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
 
     from analysis.results import finished_runs
     from sweeps.judge.judged_table import JudgedTable
-    from sweeps.judge.reader import RunReader
     from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
     from sweeps.plan.request import (
@@ -88,6 +87,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     )
     from sweeps.plan.table import is_own, table_names
     from sweeps.score.efficiency import network_sizes
+    from sweeps.score.reader import RunReader
 
     names = table_names(Path("none"))
     if options.table != ALL:
