@@ -30,12 +30,12 @@ from sweeps.judge.contrasts import (
     effects_claimed,
     printed_values,
 )
-from sweeps.judge.reader import RunReader
 from sweeps.plan.claim import HIGHER, LOWER, Claim
 from sweeps.plan.request import UNTIL_DECIDED, RowSeed, TableRequest
 from sweeps.plan.table import Column, is_counted, metric_of, words_of, world_words
 from sweeps.point import Outcome
 from sweeps.score.cells import CellId, ScoredTable, TableCell, score, size_marks
+from sweeps.score.reader import RunReader
 
 # Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000

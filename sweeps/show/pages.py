@@ -20,9 +20,9 @@ from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
-from sweeps.judge.reader import RunReader
 from sweeps.judge.stored_tables import judged_tables, known_tables
 from sweeps.plan.planner import Planner
+from sweeps.score.reader import RunReader
 from sweeps.show.claims import counts_grid, statement
 from sweeps.show.sections import (
     STUDIES,
