@@ -19,7 +19,7 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.new_images import of_arrays, of_files
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.images import batch_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import summary
 from rgbt.runs.folder import GROUP, find_run

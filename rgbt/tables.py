@@ -107,8 +107,10 @@ class TextTable:
         Control characters and new lines of names become "?".
         """
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.header)
-        is_text = [place == 0 or any(map(LABEL.match, each)) for place, each in enumerate(columns)]
-        rule = ["---" if each else "---:" for each in is_text]
+        rule = []
+        for number, column in enumerate(columns):
+            is_text = number == 0 or any(map(LABEL.match, column))
+            rule.append("---" if is_text else "---:")
         rows = ([cell.replace("|", "\\|") for cell in row] for row in self.rows)
         lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *rows)]
         title = [f"**{self.title}**", ""] if self.title else []

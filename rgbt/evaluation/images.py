@@ -34,8 +34,7 @@ from rgbt.data.pseudo_labels import (
     label_path,
 )
 from rgbt.engine.progress import progress
-from rgbt.evaluation.measure import check, legend_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
 from rgbt.metrics.measurement import Measurement
@@ -66,20 +65,20 @@ def write_images(
 ) -> str:
     """Write NAME_overlay.png and NAME.png of every image to `out`; how many, and where."""
     images.check_out(out)
-    legend = legend_of(session.dataset)
     written = 0
     with progress() as display:
         task = display.add_task("predicting", total=len(images.names), note="images")
         for sample in images.samples(session.loading.on_error):
             classes = predictor.classes(batch_of(session, sample))[0].cpu().numpy()
             classes = classes if label_map is None else label_map(classes)
-            painted = overlay(sample.rgb, classes, legend)
+            painted = overlay(sample.rgb, classes, session.dataset)
             # A line of a list of images may begin with "../".
             write_png(inside(out / f"{sample.name}_overlay.png", out), painted[..., ::-1])
             write_png(inside(out / f"{sample.name}.png", out), classes)
             written += 1
             display.advance(task)
-    for first in list(images.skipped.values())[:1]:
+    if images.skipped:
+        first = next(iter(images.skipped.values()))
         info(f"{len(images.skipped)} image(s) skipped; the first: {first}")
     return f"{written} images in {out.resolve()}"
 
@@ -169,15 +168,17 @@ def _predict(
     """Predict and write all images of the split; the part of the manifest that counts them."""
     names = session.dataset.names(wanted.split)
     batches = eval_batches(session.dataset, wanted.split, session.transform, session.loading)
-    predictor = check(session, wanted)
+    head: Any = wanted.head or None
+    predictor = Predictor(session, wanted.view, head)  # type: ignore[arg-type]
     digest = hashlib.sha256()
     counts, sums = np.zeros(IGNORE + 1, np.int64), np.zeros(IGNORE + 1)
     with progress() as display:
         task = display.add_task("predicting", total=len(names), note="images")
         for batch in batches:
             found = predictor.probabilities(batch.to(session.device))
-            confidence, classes = (each.cpu().numpy() for each in best_of(found))
-            for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
+            confidence, classes = best_of(found)
+            by_image = zip(batch.name, confidence.cpu().numpy(), classes.cpu().numpy(), strict=True)
+            for name, sure, ids in by_image:
                 known = ids.astype(np.uint8)
                 known = known if label_map is None else label_map(known)
                 label = np.where(sure < threshold, np.uint8(IGNORE), known)
@@ -193,18 +194,17 @@ def _predict(
     total = int(counts.sum())
     if not total:
         raise InputError(f"split '{wanted.split}': no image could be read.")
-    means = [
-        float(added) / FULL / int(n) if n else None for n, added in zip(counts, sums, strict=True)
-    ]
+    by_class = {}
+    for number, name in enumerate(session.dataset.classes):
+        pixels = int(counts[number])
+        mean = float(sums[number]) / FULL / pixels if pixels else None
+        by_class[name] = {"share": pixels / total, "mean_confidence": mean}
     return {
         "images": len(names) - len(batches.skipped),
         "skipped": sorted(batches.skipped),
         "kept": 1 - int(counts[IGNORE]) / total,
         "mean_confidence": float(sums.sum()) / FULL / total,
-        "by_class": {
-            name: {"share": int(counts[number]) / total, "mean_confidence": means[number]}
-            for number, name in enumerate(session.dataset.classes)
-        },
+        "by_class": by_class,
         "digest": digest.hexdigest(),
     }
 
@@ -220,14 +220,17 @@ def weights_digest(model: nn.Module) -> str:
 
 def labels_table(labels: PseudoLabels) -> TextTable:
     """The share of pixels of each class, and the teacher's confidence in them."""
-    made = labels.manifest
-    rows = [
-        (name, each["share"], each["mean_confidence"]) for name, each in made["by_class"].items()
-    ]
-    kept, total = made["kept"], sum(share * (mean or 0.0) for _, share, mean in rows)
+    made, total = labels.manifest, 0.0
+    rows = []
+    for name, found in made["by_class"].items():
+        rows.append((name, found["share"], found["mean_confidence"]))
+        total += found["share"] * (found["mean_confidence"] or 0.0)
+    kept = made["kept"]
     rows += [("kept", kept, total / kept if kept else None)]
     rows += [("all pixels", 1.0, made["mean_confidence"])]
     which = f"confidence of at least {made['threshold']:g}" if made["threshold"] else "every pixel"
     title = f"{made['images']} images of {made['dataset']} {made['split']}, {which}"
-    grid = [(name, percent(a), percent(float("nan") if b is None else b)) for name, a, b in rows]
+    grid = []
+    for name, share, mean in rows:
+        grid.append((name, percent(share), percent(float("nan") if mean is None else mean)))
     return TextTable(title, ("class", "pixels", "confidence"), tuple(grid))

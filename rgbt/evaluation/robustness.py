@@ -10,7 +10,7 @@ from rgbt.config.corruption_node import ChosenCorruption
 from rgbt.engine.progress import progress
 from rgbt.evaluation.corruption import corrupted, corruption_of
 from rgbt.evaluation.measure import files_of, measure, measurement_of, store, stored
-from rgbt.evaluation.predictor import view_of
+from rgbt.evaluation.predict import view_of
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement

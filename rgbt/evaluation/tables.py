@@ -60,14 +60,14 @@ def overview(opened: Session, files: Mapping[Path, Counts], note: str = "") -> G
     label, head = label_of(opened, counts), cast(TestedHead, counts.measurement.head)
     lines = [("heads", opened.domains.heads_in_words(head))] if head else []
     lines.append(("counts", f"{path} ({note})" if note else str(path)))
-    for file, each in others:
-        details = details_of(each.partition)
+    for file, detailed in others:
+        details = details_of(detailed.partition)
         assert details is not None, "the others are of details"
         lines.append((details.kind, str(file)))
     tables = result_tables(counts, opened.regions, label, opened.step)
     return Group(
         result_view(tables, opened.folder, [line for line in lines if line[1]]),
-        *(rich_table(_details_table(each, label)) for _, each in others),
+        *(rich_table(_details_table(detailed, label)) for _, detailed in others),
     )
 
 

@@ -134,9 +134,9 @@ class ExportedNetwork(nn.Module):
         wanted["scores"] = (kind, (len(made.classes), *hw))
         values = (*self._graph.get_inputs(), *self._graph.get_outputs())
         found = {}
-        for each in values:
-            sizes = ("open" if isinstance(size, str) else size for size in each.shape[1:])
-            found[each.name] = each.type, tuple(sizes)
+        for entry in values:
+            sizes = ("open" if isinstance(size, str) else size for size in entry.shape[1:])
+            found[entry.name] = entry.type, tuple(sizes)
         if found != wanted:
             raise InputError(f"{path} has the inputs and outputs {found}, but states {wanted}.")
 
@@ -231,8 +231,9 @@ def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
     assert written is not None, "dynamo=True returns the program"
     proto = written.model_proto
     body = proto.graph
-    for each in (body, *body.node, *body.input, *body.output, *body.value_info, *body.initializer):
-        del each.metadata_props[:]  # notes of the exporter, with paths of this machine
+    noted = (body, *body.node, *body.input, *body.output, *body.value_info, *body.initializer)
+    for part in noted:
+        del part.metadata_props[:]  # notes of the exporter, with paths of this machine
     for name, value in asdict(made).items():
         proto.metadata_props.add(key=f"{PREFIX}{name}", value=json.dumps(value))
     content: bytes = proto.SerializeToString()
@@ -268,11 +269,11 @@ def _check_constants(content: bytes) -> None:
         yield from [message] if isinstance(message, onnx.TensorProto) else []
         for field, value in message.ListFields():
             if field.message_type is not None:
-                for each in [value] if hasattr(value, "ListFields") else value:
-                    yield from tensors(each)
+                for inner in [value] if hasattr(value, "ListFields") else value:
+                    yield from tensors(inner)
 
     model = onnx.load_model_from_string(content)
-    if any(each.data_location == onnx.TensorProto.EXTERNAL for each in tensors(model)):
+    if any(found.data_location == onnx.TensorProto.EXTERNAL for found in tensors(model)):
         raise ValueError("it keeps constants in another file, which is not read")
 
 

@@ -36,7 +36,7 @@ def check_writable(setting: str, folder: Path) -> None:
     `setting` is the word that named it, such as "runs_dir=/data", with which the InputError begins.
     """
     places = (folder.absolute(), *folder.absolute().parents)
-    there = next(each for each in places if os.path.exists(each))  # noqa: PTH110 - raises nothing
+    there = next(place for place in places if os.path.exists(place))  # noqa: PTH110 - raises nothing
     try:
         # Permissions do not tell: of a file system that is read-only or full, or of /proc.
         with tempfile.TemporaryDirectory(prefix=".", dir=there):

@@ -78,7 +78,8 @@ def disguise(path: Path) -> str:
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
     """`value` as JSON, with the checksum of all other entries as its last entry, "crc32"."""
-    plain = {key: each for key, each in json.loads(json.dumps(value)).items() if key != "crc32"}
+    plain = json.loads(json.dumps(value))
+    plain.pop("crc32", None)
     return {**plain, "crc32": f"{zlib.crc32(json.dumps(plain, sort_keys=True).encode()):08x}"}
 
 

@@ -190,10 +190,10 @@ def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray
 def check_same_means(first: Counts, other: Counts) -> None:
     """Refuse to compare counts whose means are over different classes, by InputError."""
     if set(first.unscored) != set(other.unscored):
-        left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
+        left_out, others = (", ".join(counts.unscored) or "no class" for counts in (first, other))
         raise InputError(
-            f"counts whose means leave out {left_out[0]} cannot be compared with those that leave "
-            f"out {left_out[1]}. Evaluate both with the same dataset.unscored."
+            f"counts whose means leave out {left_out} cannot be compared with those that leave "
+            f"out {others}. Evaluate both with the same dataset.unscored."
         )
 
 

@@ -111,7 +111,7 @@ class Measurement:
     @property
     def identity(self) -> dict[str, Any]:
         """The fields that decide the counts, as plain values."""
-        return {each.name: getattr(self, each.name) for each in fields(self) if each.compare}
+        return {key.name: getattr(self, key.name) for key in fields(self) if key.compare}
 
     @property
     def digest(self) -> str:
@@ -216,7 +216,7 @@ class Measurement:
 
     def to_json(self) -> str:
         """Every field, and the digest."""
-        plain = {each.name: getattr(self, each.name) for each in fields(self)}
+        plain = {key.name: getattr(self, key.name) for key in fields(self)}
         return json.dumps({**plain, "digest": self.digest}, sort_keys=True)
 
     @classmethod
@@ -227,11 +227,11 @@ class Measurement:
         found: Measurement = parse_json(json.dumps(plain), cls)
         if found.digest != digest:
             raise ValueError("the measurement does not match its digest")
-        texts = [each for each in vars(found).values() if isinstance(each, str)]
+        texts = [value for value in vars(found).values() if isinstance(value, str)]
         texts += [*found.statistics_of, *found.changed, *found.dataset_words]
         for pair in found.settings:
             texts += pair
-        if any(CONTROL.search(each) for each in texts):
+        if any(CONTROL.search(text) for text in texts):
             raise ValueError("a text of the measurement has control characters")
         return found
 

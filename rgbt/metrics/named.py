@@ -138,10 +138,11 @@ def values(
         return np.asarray(mean)
 
     if parsed.score in CHANGES:
-        part, every = (
-            each.sum(-1) if index is None else each[..., index]
-            for each in CHANGES[parsed.score](by_region)
-        )
+        part, every = CHANGES[parsed.score](by_region)
+        if index is None:
+            part, every = part.sum(-1), every.sum(-1)
+        else:
+            part, every = part[..., index], every[..., index]
         return 100.0 * np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
     if parsed.score in PAIR_SCORES:
         return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))

@@ -32,7 +32,7 @@ class PairList:
     """The content of ``pairs.json``; `complete`: all images are written.
 
     `name` is that of the data set, `dataset` its fingerprint. `views` marks the second frames
-    (`rgbt.evaluation.pair_frames.Pairing`); "published": the published sets of virtual views.
+    (`rgbt.evaluation.pairs.frames.FramePairs`); "published": the published sets of virtual views.
     """
 
     format: Literal["rgbt pairs 1"]
@@ -75,7 +75,8 @@ def check_same(listed: PairList, wanted: PairList) -> None:
     if not listed.complete:
         raise InputError(f"the export of {listed.name} was interrupted; rerun it, then predict.")
     for key in ("split", "frames", "dataset", "views", "pairs"):
-        exported, counted = (one_line(getattr(each, key)) for each in (listed, wanted))
-        if getattr(listed, key) != getattr(wanted, key):
-            said = f"the pairs were exported from {exported}, but {counted} is counted"
+        exported, counted = getattr(listed, key), getattr(wanted, key)
+        if exported != counted:
+            said = f"the pairs were exported from {one_line(exported)}, but {one_line(counted)}"
+            said += " is counted"
             raise InputError(f"{key}: {said}; give the settings of the export.")

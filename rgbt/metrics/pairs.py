@@ -49,7 +49,7 @@ def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
 def protocol_of(partition: str) -> Protocol | None:
     """The protocol of a partition; None: the counts are of single frames."""
     found = re.fullmatch(r"([a-z]+)\d+(-[0-9a-f]+)?", partition)
-    return next((each for each in PROTOCOLS if found and found[1] == each), None)
+    return next((known for known in PROTOCOLS if found and found[1] == known), None)
 
 
 def tc(pairs: Matrices, absent: Absent) -> Scores:

@@ -175,18 +175,19 @@ def absent_notes(
     there = labelled | (by_region.sum(-2) > 0)
     gone, unlabelled = ~there.any(0), there.any(0) & ~labelled.any(0)
     lacks = []
-    for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
-        regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
-        lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
-    gone, unlabelled = (np.array(classes)[scored & each].tolist() for each in (gone, unlabelled))
+    for index in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
+        regions = [str(number) for number in (np.flatnonzero(~there[:, index]) + 1)]
+        lacks.append(f"{classes[index]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
     named = {
-        f"absent from the {split} split: {{}} ({counted})": gone,
-        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": unlabelled,
+        f"absent from the {split} split: {{}} ({counted})": np.array(classes)[scored & gone],
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": np.array(classes)[
+            scored & unlabelled
+        ],
         f"absent from some regions: {{}}; {counted} there": lacks,
     }
-    notes = [note.format(", ".join(each)) for note, each in named.items() if each]
+    notes = [note.format(", ".join(found)) for note, found in named.items() if len(found)]
     places = (labelled.any(0), *labelled)  # the whole image, then its regions
-    alone = [place for place, each in enumerate(places) if _is_alone(each, scored, absent)]
+    alone = [n for n, classes_of in enumerate(places) if _is_alone(classes_of, scored, absent)]
     if alone:
         where = ", ".join(f"region {place}" for place in alone)
         where = f"the {split} split" if alone[0] == 0 else where

@@ -18,7 +18,7 @@ from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.batch_norm import normalised
 from rgbt.evaluation.measure import measure, measurement_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement, Statistics
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify

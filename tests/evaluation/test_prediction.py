@@ -17,7 +17,7 @@ from rgbt.config.compose import compose
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.measure import measurement_of
-from rgbt.evaluation.predictor import Predictor, heads_of, view_of
+from rgbt.evaluation.predict import Predictor, heads_of, view_of
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
 from rgbt.types import Batch, Output

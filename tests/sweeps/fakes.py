@@ -21,7 +21,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.evaluation import Words, measurement_of
 from sweeps.point import Outcome, Point
 from sweeps.run import driver as drivers
@@ -338,7 +338,7 @@ class Desk:
         planner: Any = None,
         **changes: Any,
     ) -> None:
-        self.runs, self.settings = RunStore(runs_dir, NoTracking()), settings(**changes)
+        self.runs, self.settings = RunStore(runs_dir, Tracking()), settings(**changes)
         self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
         self.planner: Any = planner or FakePlanner()
 

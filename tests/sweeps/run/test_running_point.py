@@ -12,7 +12,7 @@ import pytest
 
 from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.point import Point
 from sweeps.run import running_point
 from sweeps.run.driver import work_of
@@ -46,7 +46,7 @@ class Bench:
         plan: Any = PLAN,
         begin: int = 0,
     ) -> None:
-        self.executor, self.runs = FakeExecutor(behaviour), RunStore(runs_dir, NoTracking())
+        self.executor, self.runs = FakeExecutor(behaviour), RunStore(runs_dir, Tracking())
         work = work_of(plan, self.runs, "")
         (job,) = self.executor.submit([work])
         self.point = RunningPoint(Task(plan, 0, report), job, work.log, begin)

@@ -112,20 +112,22 @@ def from_runs(
 def with_onnx(networks: Sequence[ProfiledNetwork]) -> list[ProfiledNetwork]:
     """Each network followed by its exported form, "NAME, ONNX"; InputError without the packages."""
     require_packages()
-    pairs = [(each, replace(each, name=f"{each.name}, ONNX", is_onnx=True)) for each in networks]
-    return [network for pair in pairs for network in pair]
+    found = []
+    for network in networks:
+        found += [network, replace(network, name=f"{network.name}, ONNX", is_onnx=True)]
+    return found
 
 
 def check_networks(networks: Sequence[ProfiledNetwork]) -> None:
     """Raise InputError where ratios would mean nothing, or two networks have one name."""
-    names = [each.name for each in networks]
+    names = [network.name for network in networks]
     if len(set(names)) < len(names):
         raise InputError(f"networks: a name occurs twice in {', '.join(names)}.")
     for key in ("accelerator", "threads"):
-        values = {str(getattr(each.trainer, key)): each.name for each in networks}
+        values = {str(getattr(network.trainer, key)): network.name for network in networks}
         if len(values) > 1:
             raise InputError(f"trainer.{key}: networks are compared with one value, got {values}.")
-    if any(each.is_onnx for each in networks) and networks[0].trainer.accelerator != "cpu":
+    if any(network.is_onnx for network in networks) and networks[0].trainer.accelerator != "cpu":
         raise InputError("trainer.accelerator: onnx=true compares on the CPU; set it to cpu.")
 
 
@@ -145,8 +147,10 @@ class PreparedNetwork:
             model: nn.Module = network.model.build()
         on_gpu = self.device.type == "cuda"
         self._allocated = torch.cuda.memory_allocated(self.device) if on_gpu else 0
-        self.parameters = sum(each.numel() for each in model.parameters())
-        self.trainable = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        self.parameters = self.trainable = 0
+        for weights in model.parameters():
+            self.parameters += weights.numel()
+            self.trainable += weights.numel() if weights.requires_grad else 0
         # The counter of operations follows gradients otherwise, which a prediction does not have.
         self._model: nn.Module = model.eval().requires_grad_(False).to(self.device)
         self._view = network.view or record_of(model).views[0]

@@ -1,7 +1,4 @@
-"""Predict two frames of every scene and count them together, for TC and CA.
-
-See `rgbt.evaluation.pair_frames` for the second frames.
-"""
+"""Count both predictions of every scene together, for TC and CA, and make their tables."""
 
 from __future__ import annotations
 
@@ -17,16 +14,9 @@ from torch.nn import functional as F
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.engine.progress import progress
-from rgbt.evaluation.measure import check, counts_of, of_partition
-from rgbt.evaluation.pair_frames import (
-    Compared,
-    EvaluationData,
-    FlowRecord,
-    Pairing,
-    Predict,
-    Scenes,
-    scenes,
-)
+from rgbt.evaluation.measure import counts_of, of_partition, predictor_of
+from rgbt.evaluation.pairs.frames import FramePairs
+from rgbt.evaluation.pairs.scenes import Compared, FlowRecord, Predict, Scenes, scenes
 from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
@@ -43,7 +33,7 @@ CountsBySet = dict[int, NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
-class Pairs:
+class CountedPairs:
     """Counts of pairs by protocol (`rgbt.metrics.pairs`), scenes for pictures, flow records."""
 
     counts: dict[Protocol, Counts]
@@ -52,58 +42,59 @@ class Pairs:
 
 
 def count_pairs(
-    session: Session, wanted: Measurement, pairing: Pairing, keep: Collection[str] = ()
-) -> Pairs:
+    session: Session, wanted: Measurement, pairs: FramePairs, keep: Collection[str] = ()
+) -> CountedPairs:
     """Predict both frames of every scene of a split, with the network left in evaluation mode.
 
     Source: Temporal, Fig. 4 (aligned: the first prediction is warped to the second frame) and its
-    release (released: it is not warped). `session.consistency` says which virtual views; `keep` are
-    names of scenes that are returned for pictures.
+    release (released: it is not warped).
+
+    Args:
+        session: with the network.
+        wanted: the measurement of the network on the split of `pairs`.
+        pairs: the pairs of frames of its data set.
+        keep: names of scenes that are returned for pictures.
 
     Raises:
-        InputError: no sets of views, no second frames, or no image that can be read.
+        InputError: no image can be read, or a measurement that does not fit the network.
     """
-    # What cannot be measured is refused before anything is drawn or predicted.
-    pairing.check(session)
-    predictor = check(session, wanted)
+    predictor = predictor_of(session, wanted)
     return count_predicted(
-        session, lambda batch, _: predictor.classes(batch), wanted, pairing, session.device, keep
+        pairs, lambda batch, _: predictor.classes(batch), wanted, session.device, keep
     )
 
 
 def count_predicted(
-    data: EvaluationData,
+    pairs: FramePairs,
     predict: Predict,
     wanted: Measurement,
-    pairing: Pairing,
     device: torch.device,
     keep: Collection[str] = (),
-) -> Pairs:
+) -> CountedPairs:
     """Count what `predict` says of both frames of every scene, in batches on `device`.
 
     Raises:
         InputError: an image or a prediction cannot be read, or no pair of a video can be used.
     """
-    split, num_classes = wanted.split, len(data.dataset.classes)
-    found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in pairing.protocols}
+    num_classes, protocols = len(pairs.dataset.classes), pairs.protocols
+    found: dict[Protocol, dict[str, CountsBySet]] = {protocol: {} for protocol in protocols}
     kept: dict[str, PairExample] = {}
     records: list[FlowRecord] = []
-    drawn: Protocol = "flow" if pairing.flow else pairing.protocols[0]
     with progress() as display:
-        total = len(pairing.names(data, split))
-        task = display.add_task(f"{split} pairs", total=total, note="images")
-        for batch in scenes(data, predict, split, pairing, device):
+        total = len(pairs.names)
+        task = display.add_task(f"{pairs.split} pairs", total=total, note="images")
+        for batch in scenes(pairs, predict, device):
             records += batch.records
             for protocol, maps in batch.compared.items():
                 _count(batch, maps, num_classes, found[protocol])
-            new = [name for name in batch.names if name in keep and name not in kept]
-            kept |= {name: _example(batch, name, drawn) for name in new if batch.compared}
-            done = len(records) if pairing.frames == "video" else len(found[pairing.protocols[0]])
+            _keep(batch, "flow" if pairs.flow else protocols[0], keep, kept)
+            done = len(records) if pairs.frames == "video" else len(found[protocols[0]])
             display.update(task, completed=done)
-    if pairing.frames == "video" and all(each.used < pairing.least_used for each in records):
+    most_used = max((record.used for record in records), default=0.0)
+    if pairs.frames == "video" and (not records or most_used < pairs.least_used):
         raise InputError(
-            f"least_used={pairing.least_used:g}: no pair of frames has a reliable flow at this "
-            f"share of its pixels (at most {max((each.used for each in records), default=0):.3f})."
+            f"least_used={pairs.least_used:g}: no pair of frames has a reliable flow at this "
+            f"share of its pixels (at most {most_used:.3f})."
         )
     counts = {}
     for protocol, by_name in found.items():
@@ -111,15 +102,15 @@ def count_predicted(
             continue
         joined = {name: np.concatenate([*by_set.values()]) for name, by_set in by_name.items()}
         sets = max(map(len, by_name.values()), default=0)
-        partition = partition_name(protocol, sets, pairing.mark(data, protocol))
-        each_scene = counts_of(data.dataset, of_partition(wanted, partition), joined)
-        counts[protocol] = each_scene.added(data.consistency.scenes_per_count)
-    return Pairs(counts, tuple(kept.values()), tuple(records))
+        partition = partition_name(protocol, sets, pairs.mark(protocol))
+        by_scene = counts_of(pairs.dataset, of_partition(wanted, partition), joined)
+        counts[protocol] = by_scene.added(pairs.views.scenes_per_count)
+    return CountedPairs(counts, tuple(kept.values()), tuple(records))
 
 
 def _count(batch: Scenes, maps: Compared, num_classes: int, found: dict[str, CountsBySet]) -> None:
     """Add the scenes of a batch; a name that a list holds twice counts once."""
-    first, second, label = (each.cpu() for each in maps[:3])
+    first, second, label = maps.first.cpu(), maps.second.cpu(), maps.label.cpu()
     valid = None if maps.valid is None else maps.valid.cpu()
     for at, name in enumerate(batch.names):
         seen = None if valid is None else valid[at]
@@ -127,16 +118,26 @@ def _count(batch: Scenes, maps: Compared, num_classes: int, found: dict[str, Cou
         found.setdefault(name, {})[batch.number] = counts
 
 
-def _example(batch: Scenes, name: str, protocol: Protocol) -> PairExample:
-    maps, number = batch.compared[protocol], batch.names.index(name)
-    assert maps.valid is not None, "the protocol that is drawn says what is seen"
-    label_hw = (batch.first.shape[1], batch.first.shape[2])
-    first_rgb, second_rgb = (_picture(images[number], label_hw) for images in batch.images)
-    first, second, followed, seen = (
-        each[number].cpu().numpy() for each in (batch.first, maps.second, maps.first, maps.valid)
-    )
-    flow = batch.flows[number].flow if batch.flows else None
-    return PairExample(name, first_rgb, first, second_rgb, second, followed, seen, flow)
+def _keep(
+    batch: Scenes, protocol: Protocol, keep: Collection[str], kept: dict[str, PairExample]
+) -> None:
+    """Add the scenes of a batch that are drawn to `kept`, each once."""
+    for at, name in enumerate(batch.names):
+        if name not in keep or name in kept or not batch.compared:
+            continue
+        maps = batch.compared[protocol]
+        assert maps.valid is not None, "the protocol that is drawn says what is seen"
+        label_hw = (batch.first.shape[1], batch.first.shape[2])
+        kept[name] = PairExample(
+            name=name,
+            first_rgb=_picture(batch.images[0][at], label_hw),
+            first=batch.first[at].cpu().numpy(),
+            second_rgb=_picture(batch.images[1][at], label_hw),
+            second=maps.second[at].cpu().numpy(),
+            followed=maps.first[at].cpu().numpy(),
+            seen=maps.valid[at].cpu().numpy(),
+            flow=batch.flows[at].flow if batch.flows else None,
+        )
 
 
 def _picture(image: Tensor, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
@@ -152,22 +153,24 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
     """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
-    scores = {
-        protocol: [
-            pair_scores(name, counts.by_region(), counts.partition, absent)
-            for name in HEADLINES[protocol][:2]
-        ]
-        for protocol, counts in found.items()
-        if TC in HEADLINES[protocol]
-    }
+    # Of TC, then of CA: by protocol the scores of the classes, and their mean.
+    by_class: list[dict[str, tuple[float, ...]]] = [{}, {}]
+    means: list[dict[str, float]] = [{}, {}]
+    for protocol, counts in found.items():
+        if TC not in HEADLINES[protocol]:
+            continue
+        for number, name in enumerate(HEADLINES[protocol][:2]):
+            scores = pair_scores(name, counts.by_region(), counts.partition, absent)
+            by_class[number][protocol] = tuple(map(float, scores))
+            means[number][protocol] = float(class_mean(scores, like.scored))
     there = pair_scores(TC, like.by_region(), like.partition, "exclude")
     lacking = [name for name, tc in zip(like.classes, there, strict=True) if np.isnan(tc)]
     return ConsistencyTable(
         names=like.classes,
-        tc={protocol: tuple(map(float, tc)) for protocol, (tc, _) in scores.items()},
-        ca={protocol: tuple(map(float, ca)) for protocol, (_, ca) in scores.items()},
-        mean_tc={each: float(class_mean(tc, like.scored)) for each, (tc, _) in scores.items()},
-        mean_ca={each: float(class_mean(ca, like.scored)) for each, (_, ca) in scores.items()},
+        tc=by_class[0],
+        ca=by_class[1],
+        mean_tc=means[0],
+        mean_ca=means[1],
         unscored=like.unscored,
         notes=(f"{absent_rule(absent)} Without one: {', '.join(lacking) or 'no class'}.",),
     )
@@ -184,10 +187,11 @@ def consistency_values(table: ConsistencyTable) -> dict[str, float]:
 
 def changes_grid(found: Mapping[Protocol, Counts]) -> TextTable:
     """Warping error and flicker of every protocol that has them; percent of the pixels."""
-    rows = tuple(
-        (f"{score.replace('_', ' ')}, {protocol}", f"{value(score, counts, counts.absent):.2f}")
-        for protocol, counts in found.items()
-        for score in CHANGES
-        if score in SCORES_OF[protocol]
-    )
-    return TextTable("Changes of the prediction along the motion", ("", "% of pixels"), rows)
+    rows = []
+    for protocol, counts in found.items():
+        for score in CHANGES:
+            if score in SCORES_OF[protocol]:
+                share = value(score, counts, counts.absent)
+                rows.append((f"{score.replace('_', ' ')}, {protocol}", f"{share:.2f}"))
+    title = "Changes of the prediction along the motion"
+    return TextTable(title, ("", "% of pixels"), tuple(rows))
