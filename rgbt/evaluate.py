@@ -99,7 +99,7 @@ def main(options: Options, overrides: list[str]) -> int:
     by_view = {}
     for view in views:
         wanted = measure.measurement_of(opened, split, view, head, *of_norm)
-        if not by_view:
+        if view == views[0]:
             measure.predictor_of(opened, wanted)  # refuses what cannot be measured
             announce_network(opened)
         files = measure.files_of(opened, wanted, details, out)

@@ -93,8 +93,8 @@ def export(
     if not by_size:
         raise InputError(f"split '{split}' of {session.dataset.name} has no image.")
     is_dynamic = image_hw == "dynamic"
-    if not isinstance(image_hw, tuple):
-        image_hw = max(by_size, key=lambda hw: len(by_size[hw]))
+    most = max(by_size, key=lambda hw: len(by_size[hw]))
+    size = image_hw if isinstance(image_hw, tuple) else most
     graph = ScoresOfImages(session.model.cpu().float().eval(), view=predictor.view, head=head)
     description = Description(
         network=type(session.model).__name__,
@@ -106,7 +106,7 @@ def export(
         view=predictor.view,
         head=head,
         outputs=record_of(session.model).outputs,
-        image_hw=image_hw,
+        image_hw=size,
         dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.
         settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
@@ -114,15 +114,15 @@ def export(
     content = onnx_bytes(graph, description)
     network = ExportedNetwork(content, out)
     readable = [name for names in by_size.values() for name in names]
-    names = by_size.get(image_hw, readable)
+    names = by_size.get(size, readable)
     if is_dynamic:  # one of each size, then others
         firsts = [of_one_size[0] for of_one_size in by_size.values()]
         names = [*dict.fromkeys([*firsts, *readable])]
     images = [_image(session, found, name) for name in names[:num_images]]
     if is_dynamic:
-        images += [_resized(images[0], hw) for hw in other_sizes(image_hw)]
+        images += [_resized(images[0], hw) for hw in other_sizes(size)]
     else:
-        images = [_resized(pair, image_hw) for pair in images]
+        images = [_resized(pair, size) for pair in images]
     try:
         comparison = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
         comparison.check(tolerance)
@@ -149,7 +149,7 @@ def check_out(out: Path) -> None:
 def compare(
     reference: ScoresOf, scores_of: ScoresOf, images: list[tuple[Tensor, Tensor]]
 ) -> Comparison:
-    """The network in PyTorch and the exported graph on the same images, at least one.
+    """Compare the network in PyTorch with the exported graph on the same images, at least one.
 
     Of each size the first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal
     (1, 1, H, W).
@@ -184,7 +184,7 @@ def only_head(predictor: Predictor, names: tuple[str, ...]) -> str | None:
 
 
 def other_sizes(image_hw: Hw) -> tuple[Hw, ...]:
-    """Sizes for the comparison of a dynamic graph: lower, narrower and larger, with odd sides."""
+    """Return sizes to compare a dynamic graph at: lower, narrower and larger, with odd sides."""
     height, width = image_hw
     lower, narrower = height * 3 // 4 | 1, width * 2 // 3 | 1
     return (lower, width), (height, narrower), (height * 5 // 4 | 1, width * 5 // 4 | 1)

@@ -45,7 +45,7 @@ from rgbt.types import IGNORE, Batch, Sample
 
 
 def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
-    """The images of the options ``input``, or ``rgb`` and ``thermal``."""
+    """Return the images of the options ``input``, or ``rgb`` and ``thermal``."""
     if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
         raise InputError("expected either input=... or both rgb=FILE and thermal=FILE.")
     dataset = session.dataset
@@ -84,7 +84,7 @@ def write_images(
 
 
 def batch_of(session: Session, sample: Sample) -> Batch:
-    """One image on the device; one at a time, because images of a folder may have any sizes."""
+    """Put one image on the device; images of a folder may have different sizes."""
     return collate([session.transform.test(sample)], "").to(session.device)
 
 
@@ -97,7 +97,7 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
 
 
 def label_map_of(name: str) -> LabelMap | None:
-    """The file of ``conf/label_map/`` called `name`; None for "none"."""
+    """Build the file of ``conf/label_map/`` called `name`; None for "none"."""
     if name == "none":
         return None
     with composing([]):
@@ -210,7 +210,7 @@ def _predict(
 
 
 def weights_digest(model: nn.Module) -> str:
-    """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
+    """Return SHA-256 in hexadecimal over names and bytes of all saved parameters and buffers."""
     digest = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
@@ -219,7 +219,7 @@ def weights_digest(model: nn.Module) -> str:
 
 
 def labels_table(labels: PseudoLabels) -> TextTable:
-    """The share of pixels of each class, and the teacher's confidence in them."""
+    """Make the table of the share of pixels of each class, and the teacher's confidence in them."""
     made, total = labels.manifest, 0.0
     rows = []
     for name, found in made["by_class"].items():

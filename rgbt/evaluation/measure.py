@@ -69,7 +69,7 @@ def measurement_of(
     batch_norm: Statistics = "as trained",
     batch_norm_splits: str = "",
 ) -> Measurement:
-    """The measurement of the network of `session` on its data set, which may be corrupted.
+    """Return what is measured: the network of `session` on its data set, which may be corrupted.
 
     None means: the view and the head of the run's configuration. InputError: a view or splits
     without effect.
@@ -118,7 +118,7 @@ def measurement_of(
 
 
 def of_partition(wanted: Measurement, partition: str) -> Measurement:
-    """The same measurement, counted in another way: details, or pairs of frames."""
+    """Return the measurement that is counted in another way: details, or pairs of frames."""
     return replace(wanted, partition=partition, changed=(*wanted.changed, "partition"))
 
 
@@ -262,7 +262,7 @@ def joined(parts: Sequence[Part], names: Sequence[str]) -> Part:
 
 
 def shown(batches: Any, what: str, total: int) -> Iterator[Batch]:
-    """The batches, with a progress bar over the images of all processes."""
+    """Yield the batches, with a progress bar over the images of all processes."""
     with progress() as display:
         task = display.add_task(what, total=total, note="images")
         done = 0
@@ -278,7 +278,7 @@ def counts_of(
     by_name: Mapping[str, Matrix],
     dtype: type[np.integer] = np.int32,
 ) -> Counts:
-    """The counts (R, K, K) of each image as those of a split; InputError if there is none."""
+    """Join the counts (R, K, K) of images to those of a split; InputError if there is none."""
     names = tuple(by_name)
     if not names:
         raise InputError(f"split '{wanted.split}' of {dataset.name}: no image could be read.")
@@ -293,7 +293,7 @@ def counts_of(
 
 
 def path_of(session: Session, wanted: Measurement) -> Path:
-    """The file of the counts of a measurement: in the folder of the run, or in evaluations/."""
+    """Return the file of the counts of a measurement: in the run folder, or in evaluations/."""
     is_beside = wanted.is_own or not session.run
     return (session.folder if is_beside else session.folder / EVALUATIONS) / wanted.file_name
 
@@ -301,7 +301,7 @@ def path_of(session: Session, wanted: Measurement) -> Path:
 def files_of(
     session: Session, wanted: Measurement, details: Sequence[Details] = (), out: Path | None = None
 ) -> dict[Path, Measurement]:
-    """The file of a measurement, then those of its details; `out`: instead of `path_of`."""
+    """Return the file of a measurement, then those of its details; `out`: instead of `path_of`."""
     found = {out or path_of(session, wanted): wanted}
     for detail in details:
         detailed = of_partition(wanted, detail.partition(session.regions.name))
@@ -311,7 +311,7 @@ def files_of(
 
 
 def stored(session: Session, files: Mapping[Path, Measurement]) -> dict[Path, Counts]:
-    """The counts that their files hold already, with the scored classes of `session`.
+    """Load the counts that their files hold already, with the scored classes of `session`.
 
     InputError: a file holds another measurement, which is never replaced.
     """
@@ -348,7 +348,7 @@ def _stored(path: Path, wanted: Measurement, images: int) -> Counts | None:
 
 
 def check_replaceable(path: Path, wanted: Measurement) -> bool:
-    """Whether a file holds this measurement, and not of an earlier step of the training.
+    """Return whether a file holds this measurement, and not of an earlier step of the training.
 
     InputError: it holds another one, which is not replaced.
     """
@@ -367,7 +367,7 @@ def check_replaceable(path: Path, wanted: Measurement) -> bool:
 
 
 def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
-    """The first images of a split, half by day and half by night where it holds both."""
+    """Return the first images of a split, half by day and half by night where it holds both."""
     names = dataset.names(split)
     at_night = dataset.nights(names) or (False,) * len(names)
     night = [name for name, dark in zip(names, at_night, strict=True) if dark]

@@ -41,7 +41,7 @@ class Predictor:
         self.model = session.model.eval()
 
     def counted(self, batch: Batch) -> Batch:
-        """A batch from the loader, with labels of the size at which classes are counted."""
+        """Give a batch from the loader labels of the size at which classes are counted."""
         if self._settings.counted == "label":
             return batch
         resize = mixed if self._settings.label_resize == "bilinear" else nearest
@@ -49,7 +49,7 @@ class Predictor:
         return replace(batch, label=torch.from_numpy(np.stack(labels)))
 
     def classes(self, batch: Batch) -> Tensor:
-        """(B, H', W') uint8: class of every pixel of the labels of a batch on the device."""
+        """Predict the class of every pixel of the labels of a batch: (B, H', W') uint8."""
         if self._settings.enlarged == "scores":
             return classes_of(label_scores(*self._how(batch))).to(torch.uint8)
         # Predicted at the size of the images; class numbers are enlarged like brightness.
@@ -59,7 +59,7 @@ class Predictor:
         return torch.from_numpy(np.stack(maps)).to(found.device)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """`classes`, and the probability (B, H', W') float32 of each."""
+        """Predict `classes`, and the probability (B, H', W') float32 of each."""
         scores = label_scores(*self._how(batch))
         # The class with the highest score has the highest probability.
         confidence, _ = best_of(shares(scores, self.model))
@@ -68,7 +68,7 @@ class Predictor:
         return self.classes(batch), confidence
 
     def probabilities(self, batch: Batch) -> Tensor:
-        """(B, K, H', W') float32: see `rgbt.engine.evaluate.shares`."""
+        """Predict `rgbt.engine.evaluate.shares` of the classes: (B, K, H', W') float32."""
         return shares(label_scores(*self._how(batch)), self.model)
 
     def _how(self, batch: Batch) -> tuple[Any, ...]:

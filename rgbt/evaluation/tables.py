@@ -21,7 +21,7 @@ from rgbt.terminal import result_view, rich_table
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
-    """The tables of counts of single frames over `regions`; `label` names their row."""
+    """Make the tables of counts of single frames over `regions`; `label` names their row."""
     absent, scored = counts.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
     region_ious = scores.miou(by_region, absent, scored)
@@ -49,13 +49,13 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
 
 
 def label_of(opened: Session, counts: Counts) -> str:
-    """The name of a measurement in tables: the network, the data set and what was changed."""
+    """Name a measurement in tables: the network, the data set and what was changed."""
     of = counts.measurement
     return " · ".join(filter(None, (f"{opened.label} {of.dataset_name}", of.label or of.view)))
 
 
 def overview(opened: Session, files: Mapping[Path, Counts], note: str = "") -> Group:
-    """The tables of counts and their files: of single frames first, then of details."""
+    """Show the tables of counts and their files: of single frames first, then of details."""
     (path, counts), *others = files.items()
     label, head = label_of(opened, counts), cast(TestedHead, counts.measurement.head)
     lines = [("heads", opened.domains.heads_in_words(head))] if head else []
@@ -79,7 +79,7 @@ def _details_table(counts: Counts, label: str) -> TextTable:
 
 
 def views_table(by_view: Mapping[str, Counts], label: str) -> TextTable:
-    """The mIoU by region, one row for each input; counts of single frames."""
+    """Make the table of mIoU by region, a row for each input, of counts of single frames."""
     grid = score_grid(next(iter(by_view.values())))
     rows = [(view, *_numbers(counts, grid.metrics)) for view, counts in by_view.items()]
     return TextTable(f"{label}: {grid.title} and input", ("", *grid.columns), tuple(rows))

@@ -75,7 +75,7 @@ class Description:
 
     @classmethod
     def from_metadata(cls, path: Path, metadata: Mapping[str, str]) -> Description:
-        """The description in the metadata of the file `path`; InputError if there is none."""
+        """Read the description in the metadata of the file `path`; InputError if there is none."""
         own = {k.removeprefix(PREFIX): v for k, v in metadata.items() if k.startswith(PREFIX)}
         try:
             text = json.dumps({key: json.loads(value) for key, value in own.items()})
@@ -97,7 +97,7 @@ class ScoresOfImages(nn.Module):
         self._options: dict[str, Any] = {"views": (view,)} | ({"head": head} if head else {})
 
     def forward(self, rgb: Tensor, thermal: Tensor) -> Tensor:
-        """(B, K, H, W) scores at the size of the images."""
+        """Compute (B, K, H, W) scores at the size of the images."""
         scores: Tensor = self.network(rgb, thermal, **self._options).logits
         return scores
 
@@ -142,7 +142,7 @@ class ExportedNetwork(nn.Module):
 
     @classmethod
     def read(cls, path: Path) -> ExportedNetwork:
-        """The network of a file; InputError as of the class, or if there is none."""
+        """Read the network of a file; InputError as of the class, or if there is none."""
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
         if said := disguise(path):
@@ -151,7 +151,7 @@ class ExportedNetwork(nn.Module):
 
     @property
     def record(self) -> Record:
-        """The one view, and the one head, that the graph was made for."""
+        """Return the one view, and the one head, that the graph was made for."""
         made = self.description
         heads = (made.head,) if made.head else ()
         return Record(outputs=made.outputs, views=(made.view,), heads=heads)
@@ -159,7 +159,7 @@ class ExportedNetwork(nn.Module):
     def forward(
         self, rgb: Tensor, thermal: Tensor, *, views: tuple[View, ...] = (), head: str | None = None
     ) -> Output:
-        """Class scores, for arguments as `rgbt.models` says.
+        """Compute class scores, for arguments as `rgbt.models` says.
 
         InputError: images of another size, or another view or head than those of the file.
         """
@@ -190,7 +190,7 @@ def require_packages() -> None:
 
 
 def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
-    """The content of an ONNX file; the size of the batch stays open, of a dynamic one all sizes.
+    """Make the content of an ONNX file; the size of the batch stays open, with `dynamic` all.
 
     Whether the graph is right at other sizes than that of `made` has to be compared: what a network
     makes of its size in Python is as for that one.
@@ -243,7 +243,7 @@ def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
 def exported_network(
     network: nn.Module, view: View, image_hw: tuple[int, int], name: str
 ) -> ExportedNetwork:
-    """A network in evaluation mode on the CPU, in onnxruntime; nothing is written.
+    """Put a network in evaluation mode on the CPU into onnxruntime; nothing is written.
 
     InputError: it cannot be exported; `name` is for messages.
     """

@@ -25,7 +25,7 @@ Counted = NDArray[np.int64]
 def histogram(
     *axes: tuple[NDArray[Any], int], where: NDArray[np.bool_], weights: Any = None
 ) -> Counted:
-    """(s1, s2, ...): numbers of the pixels `where`, by indices (H, W) with s1, s2, ... values.
+    """Count the pixels `where` by indices (H, W) with s1, s2, ... values: (s1, s2, ...).
 
     `weights` are whole numbers (H, W) that are added instead of 1.
     """
@@ -144,7 +144,7 @@ def detail_counts(
 def outlined(
     classes: NDArray[np.integer], valid: NDArray[np.bool_], pixels: int, *, border: bool
 ) -> NDArray[np.bool_]:
-    """(H, W): whether a valid pixel belongs to the boundary of its class.
+    """Return whether a valid pixel belongs to the boundary of its class, (H, W).
 
     It does if the square of 2 d + 1 `pixels` around it holds a valid pixel of another class
     (0..253) or, with `border`, reaches over the border of the image. That is what d erosions of
@@ -164,7 +164,7 @@ def outlined(
 
 
 def areas(objects: NDArray[np.integer]) -> NDArray[np.float64]:
-    """(H, W): pixels of the object that each pixel belongs to; inf: of none (number 0)."""
+    """Count pixels of the object that each pixel belongs to, (H, W); inf: of none (number 0)."""
     _, inverse, pixels = np.unique(objects, return_inverse=True, return_counts=True)
     found = pixels.astype(np.float64)[inverse.reshape(objects.shape)]
     return np.where(objects == 0, np.inf, found)

@@ -47,7 +47,7 @@ class PairList:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of all images, each once."""
+        """Return the names of all images, each once."""
         names = (name for pair in self.pairs for name in (pair.first, pair.second))
         return tuple(dict.fromkeys(names))
 
@@ -57,12 +57,12 @@ class PairList:
 
 
 def second_name(first: str, frames: Frames, number: int) -> str:
-    """Name of a second frame; `number` of the set of views, from 0."""
+    """Return the name of a second frame; `number` of the set of views, from 0."""
     return f"{first}_next" if frames == "next" else f"{first}_view{number + 1}"
 
 
 def read_list(place: Path) -> PairList:
-    """The list of pairs in a folder, or at the path of the file itself; InputError: no list."""
+    """Read the list of pairs in a folder, or at the path of the file; InputError: no list."""
     path = place / PAIR_LIST if place.is_dir() else place
     if not path.is_file():
         raise InputError(f"{path} does not exist; name the folder of the export: pairs=FOLDER.")

@@ -20,12 +20,12 @@ class ScoreGrid:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """All names, row by row."""
+        """Return all names, row by row."""
         return tuple(name for _, row in self.rows for name in row)
 
 
 def score_grid(counts: Counts) -> ScoreGrid:
-    """The scores of counts; only their classes, partition and time of day are used."""
+    """Name the scores of counts; only their classes, partition and time of day are used."""
     details, protocol = details_of(counts.partition), protocol_of(counts.partition)
 
     def by_class(scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
@@ -69,7 +69,7 @@ def score_grid(counts: Counts) -> ScoreGrid:
 
 
 def headlines(counts: Counts) -> tuple[str, ...]:
-    """The scores of details that a comparison shows: means, by region or bin."""
+    """Return the scores of details that a comparison shows: means, by region or bin."""
     details = details_of(counts.partition)
     assert details is not None, "counts of details"
     if details.bins:

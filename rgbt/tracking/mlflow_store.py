@@ -99,12 +99,12 @@ class MlflowTracking(Tracking):
             self._guarded(status)
 
     def links(self) -> list[Link]:
-        """The command that opens the pages, or that sends the run to its store."""
+        """Return the command that opens the pages, or that sends the run to its store."""
         is_sent = bool(self._state(self._folder).run_id)
         return [("open MLflow", self.ui_command()) if is_sent else ("MLflow later", self._later())]
 
     def ui_command(self) -> str:
-        """The command that opens the pages of this store."""
+        """Return the command that opens the pages of this store."""
         return shlex.join(["rgbt", "ui", *self._words])
 
     def _later(self) -> str:
@@ -112,7 +112,7 @@ class MlflowTracking(Tracking):
         return shlex.join(["rgbt", "sync", f"run={self._folder.path}", *named])
 
     def sync(self, folder: RunFolder, status: Status) -> str:
-        """Bring this store up to date; the id of the MLflow run. Raises what the store raises."""
+        """Bring this store up to date; return the id of the MLflow run. Raises what it raises."""
         store = self.store()
         # A training and a sync by hand may meet in one folder.
         with locked(folder.path / "mlflow.lock"):
@@ -122,7 +122,7 @@ class MlflowTracking(Tracking):
 
     @property
     def is_open(self) -> bool:
-        """Whether the store has answered."""
+        """Return whether the store has answered."""
         return self._store is not None
 
     def store(self) -> ExperimentClient:
@@ -134,7 +134,7 @@ class MlflowTracking(Tracking):
         return self._store
 
     def _state(self, folder: RunFolder) -> UploadState:
-        """What this store has of the run; nothing if the folder was sent to another one.
+        """Return what this store has of the run; nothing if the folder was sent to another one.
 
         Where the folder of runs was moved or copied, all files are sent again, to the same run.
         """
@@ -173,7 +173,7 @@ class MlflowTracking(Tracking):
 
 
 def reason_of(error: Exception) -> str:
-    """First line of what was raised, without passwords."""
+    """Return the first line of what was raised, without passwords."""
     line = (str(error).splitlines() or [""])[0][:300]
     name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
     return f"{name}{without_passwords(line)}"

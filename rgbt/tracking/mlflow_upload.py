@@ -72,7 +72,7 @@ class UploadState:
 
 
 def read_upload_state(folder: RunFolder) -> UploadState | None:
-    """The record of this folder, or None if nothing was sent; InputError where it is damaged."""
+    """Read the record of this folder; None: nothing was sent. InputError: it is damaged."""
     path = folder.path / "mlflow.json"
     advice = "remove the file; the MLflow run is then identified by its key"
     found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
@@ -85,7 +85,7 @@ def write_upload_state(folder: RunFolder, state: UploadState) -> None:
 
 
 def is_sent(folder: RunFolder, state: UploadState) -> bool:
-    """Whether no file changed since the last complete upload; MLflow is not imported."""
+    """Return whether no file changed since the last complete upload, without importing MLflow."""
     files = [*_own_files(folder), *(folder.path / name for name in READ)]
     # The time of a change, not that of the content: a copied file keeps an old one.
     last = max((path.lstat().st_ctime for path in files if path.exists()), default=math.inf)
@@ -241,7 +241,7 @@ def _pair_scores(result: Mapping[str, Any], kind: str) -> dict[str, float]:
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
-    """The result as columns and rows in percent (Var: its own unit) for MLflow's table view.
+    """Make columns and rows in percent (Var: its own unit) for MLflow's table view.
 
     That view groups by the first column, which must be unique, and compares the second between
     runs; it shows few rows on a screen, so summaries come first.

@@ -37,7 +37,7 @@ class PairExample:
     flow: NDArray[np.float32] | None = None
 
     def motion(self) -> tuple[Image, ...]:
-        """The flow as a picture: hue is its direction, strength its length; black is not used."""
+        """Paint the flow: hue is its direction, strength its length; black is not used."""
         if self.flow is None:
             return ()
         from matplotlib.colors import hsv_to_rgb
@@ -53,7 +53,7 @@ class PairExample:
         return (picture,)
 
     def difference(self) -> Image:
-        """(H, W, 3) uint8: red where the two predictions differ, grey where nothing is compared."""
+        """Paint (H, W, 3) red where the two predictions differ, grey where nothing is compared."""
         picture = np.empty((*self.seen.shape, 3), np.uint8)
         picture[:] = AGREES
         picture[self.followed != self.second] = DIFFERS

@@ -38,7 +38,7 @@ def palette_of(dataset: LabelledDataset) -> Image:
 
 
 def colours(label: Image, palette: Image) -> Image:
-    """Classes (H, W) uint8 as colours (H, W, 3) of a palette (K, 3); 255 is `IGNORED_COLOUR`.
+    """Paint classes (H, W) uint8 in colours of a palette (K, 3): (H, W, 3); 255: `IGNORED_COLOUR`.
 
     Raises:
         ValueError: a label is neither below K nor 255.
@@ -123,7 +123,7 @@ def _broken(name: str, letters: int) -> str:
 def number_places(
     region_map: NDArray[np.integer], num_regions: int
 ) -> list[tuple[int, int] | None]:
-    """(row, column) inside each region where a number is easy to read; None for empty regions.
+    """Return (row, column) in each region where a number is easy to read; None: it is empty.
 
     The pixel nearest to the region's mean, above the middle row where that is in another region.
     """
@@ -144,7 +144,7 @@ def number_places(
 
 
 def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
-    """Ends of the colour scale in percent, equally far from the mean region.
+    """Return the ends of the colour scale in percent, equally far from the mean region.
 
     At least `HALF_SPAN`, so that pictures of most runs can be compared. Without a score: around 50.
     """

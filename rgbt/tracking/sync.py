@@ -35,7 +35,7 @@ class Options:
 
 
 def folders_of(options: Options) -> list[RunFolder]:
-    """The run folders that are requested; InputError where there is none."""
+    """Return the run folders that are requested; InputError where there is none."""
     if options.run is None:
         runs_dir = options.runs_dir or Path()
         replaced = runs_dir / REPLACED

@@ -37,5 +37,5 @@ class Tracking:
         self.finish("FINISHED")
 
     def links(self) -> list[Link]:
-        """The command that shows the run, one line."""
+        """Return the command that shows the run, one line."""
         return []

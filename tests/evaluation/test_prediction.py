@@ -134,6 +134,8 @@ def test_images_that_are_read_otherwise_are_another_measurement(tmp_path: Path) 
         )
     )
     assert measurement_of(one, "test") == measurement_of(same, "test")
-    images = [each.dataset.read(each.dataset.names("test")[0]).thermal for each in (one, other)]
+    images = [
+        session.dataset.read(session.dataset.names("test")[0]).thermal for session in (one, other)
+    ]
     assert (images[0] != images[1]).any()
     assert measurement_of(one, "test") != measurement_of(other, "test")

@@ -149,11 +149,11 @@ def test_boundary_is_what_erosions_of_each_padded_mask_leave(pixels: int, border
     rng = np.random.default_rng(pixels)
     blobs = cv2.resize(rng.integers(0, 3, (6, 8)).astype(np.uint8), (40, 30), interpolation=0)
     expected = np.zeros(blobs.shape, bool)
-    for each in range(3):
-        mask = (blobs == each).astype(np.uint8)
+    for number in range(3):
+        mask = (blobs == number).astype(np.uint8)
         padded = np.pad(mask, 9) if border else np.pad(mask, 9, mode="edge")
         eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=pixels)[9:-9, 9:-9]
-        expected |= (blobs == each) & (eroded == 0)
+        expected |= (blobs == number) & (eroded == 0)
     every = np.ones(blobs.shape, bool)
     assert np.array_equal(outlined(blobs, every, pixels, border=border), expected)
 

@@ -146,12 +146,12 @@ def _picture(image: Tensor, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """(H, W, C) of an image (C, H, W) in [0, 1]."""
+    """Return bytes (H, W, C) of an image (C, H, W) in [0, 1]."""
     return (255 * image).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
-    """TC and CA of every class and protocol; means over the scored classes."""
+    """Compute TC and CA of every class and protocol; means are over the scored classes."""
     like = next(iter(found.values()))
     # Of TC, then of CA: by protocol the scores of the classes, and their mean.
     by_class: list[dict[str, tuple[float, ...]]] = [{}, {}]
@@ -177,7 +177,7 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
 
 
 def consistency_values(table: ConsistencyTable) -> dict[str, float]:
-    """The means as metrics of a run, as fractions: "TC/aligned", "CA/aligned", ..."""
+    """Return the means as metrics of a run, as fractions: "TC/aligned", "CA/aligned", ..."""
     return {
         consistency(score, protocol): means[protocol]
         for protocol in table.tc
@@ -186,7 +186,7 @@ def consistency_values(table: ConsistencyTable) -> dict[str, float]:
 
 
 def changes_grid(found: Mapping[Protocol, Counts]) -> TextTable:
-    """Warping error and flicker of every protocol that has them; percent of the pixels."""
+    """Make the table of warping error and flicker, by protocol that has them; percent of pixels."""
     rows = []
     for protocol, counts in found.items():
         for score in CHANGES:

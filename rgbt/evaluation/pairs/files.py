@@ -78,7 +78,7 @@ def add_to_result(run: RunFolder, session: Session, split: str, table: Consisten
 
 
 def flow_sentences(records: Sequence[FlowRecord], least_used: float) -> Iterator[str]:
-    """What a user should know of the flow of all pairs."""
+    """Say what a user should know of the flow of all pairs."""
     counted = [record for record in records if record.used >= least_used]
     used = _mean([record.used for record in counted])
     error = _mean([record.end_point_error_px for record in counted])

@@ -88,7 +88,7 @@ class FramePairs:
 
     @property
     def protocols(self) -> tuple[Protocol, ...]:
-        """What is counted of each pair."""
+        """Return what is counted of each pair."""
         if self.frames == "virtual":
             return "aligned", "released"
         if self.frames == "video":
@@ -97,14 +97,14 @@ class FramePairs:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the pairs: of the first frames, in videos of the second ones."""
+        """Return the names of the pairs: of the first frames, in videos of the second ones."""
         if self.frames == "video":
             return tuple(FramesInOrder(self.dataset, self.split).pairs)
         return self.dataset.names(self.split)
 
     @property
     def pictured(self) -> tuple[str, ...]:
-        """Names of the pairs in the picture; of videos, pairs spread over all of them."""
+        """Return the names of pairs in the picture; of videos, pairs spread over all of them."""
         if self.frames == "video":
             names = self.names
             return tuple(names[len(names) * at // NUM_PANELS] for at in range(NUM_PANELS))
