@@ -79,11 +79,16 @@ def measurement_of(
         raise InputError(f"{without} with batch_norm={batch_norm}.")
     named = split_list(batch_norm_splits, "batch_norm_splits") if batch_norm_splits else []
     tested = session.domains.tested_head or ""
-    values, dataset = measured_settings(session.spec.plain), session.dataset
-    changed = ["view"] if view_of(session, view) != view_of(session) else []
-    changed += ["head"] if (head or tested) != tested else []
-    values |= reader_settings(dataset)
-    changed += [*session.changed, *(["checkpoint"] if session.checkpoint != "best" else [])]
+    dataset = session.dataset
+    values = measured_settings(session.spec.plain) | reader_settings(dataset)
+    changed = []
+    if view_of(session, view) != view_of(session):
+        changed.append("view")
+    if (head or tested) != tested:
+        changed.append("head")
+    changed += session.changed
+    if session.checkpoint != "best":
+        changed.append("checkpoint")
     if batch_norm != AS_TRAINED:
         changed += ["statistics"]
     else:  # the size of a batch changes nothing

@@ -25,7 +25,9 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
     absent, scored = counts.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
     region_ious = scores.miou(by_region, absent, scored)
-    parts = {part: scores.miou(sub.whole(), absent, scored) for part, sub in counts.parts().items()}
+    subset_mious = {}
+    for part, images in counts.parts().items():
+        subset_mious[part] = float(scores.miou(images.whole(), absent, scored))
     return ResultTables(
         split=counts.split,
         step=step,
@@ -41,7 +43,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             ious=tuple(map(float, scores.iou(whole, absent))),
             accuracies=tuple(map(float, scores.recall(whole, absent))),
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
-            subset_mious={part: float(value) for part, value in parts.items()},
+            subset_mious=subset_mious,
             unscored=counts.unscored,
             notes=scores.absent_notes(by_region, counts.classes, scored, counts.split, absent),
         ),

@@ -47,7 +47,8 @@ def flow_source(frames: Frames, flow: str) -> FlowSource | None:
     """
     if flow == "default":
         return USUAL_FLOW if frames == "video" else None
-    if frames == "virtual" and flow != "exact" or frames == "video" and flow == "exact":
+    fits = {"virtual": flow == "exact", "video": flow != "exact", "next": True}
+    if not fits[frames]:
         raise InputError(f"flow={flow} is not possible: frames={frames}.")
     return None if flow == "exact" else cast(FlowSource, flow)
 
