@@ -19,7 +19,7 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.new_images import of_arrays, of_files
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.images import batch_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import summary
 from rgbt.runs.folder import GROUP, find_run
@@ -50,32 +50,32 @@ class Run(RunResult):
 
     @property
     def name(self) -> str:
-        """Name as in MLflow, for example "sigma_div=2 seed=1 · grbm"."""
+        """Return the name as in MLflow, for example "sigma_div=2 seed=1 · grbm"."""
         return self.description.name
 
     @property
     def experiment(self) -> str:
-        """Name of the experiment, for example "grbm"."""
+        """Return the name of the experiment, for example "grbm"."""
         return self.tags.get("rgbt.experiment", "")
 
     @property
     def group(self) -> str:
-        """Name that all seeds of one configuration share, for example "grbm sigma_div=2"."""
+        """Return the name that all seeds of a configuration share, such as "grbm sigma_div=2"."""
         return self.tags.get(GROUP, "")
 
     @property
     def seed(self) -> int | None:
-        """Seed of the run; None where the folder does not state it."""
+        """Return the seed of the run; None where the folder does not state it."""
         text = self.tags.get("rgbt.seed", "")
         return int(text) if text else None
 
     @property
     def dataset(self) -> LabelledDataset:
-        """The data set of the run: classes, palette, splits and images."""
+        """Return the data set of the run: classes, palette, splits and images."""
         return self._network.dataset
 
     def scores(self, split: str = "test") -> dict[str, float]:
-        """Every score that follows from `counts`, by name (`rgbt.metrics.names`).
+        """Compute every score that follows from `counts`, by name (`rgbt.metrics.names`).
 
         Returns:
             percent, such as "mIoU", "region/1", "class/car", "day/mIoU"; "Var": squared points.
@@ -92,7 +92,7 @@ class Run(RunResult):
         modality: View | None = None,
         head: TestedHead | None = None,
     ) -> NDArray[np.uint8]:
-        """The class of every pixel of one image pair.
+        """Predict the class of every pixel of one image pair.
 
         Both images are arrays, or both are paths of files. Files are read by the rules of the run's
         data set, which may cut images and scale thermal values (``dataset.thermal_range``). Thermal
@@ -124,7 +124,7 @@ class Run(RunResult):
         modality: View | None = None,
         head: TestedHead | None = None,
     ) -> NDArray[np.float32]:
-        """The probability of every class at every pixel; arguments and errors as of `predict`.
+        """Predict the probability of every class at every pixel; arguments are those of `predict`.
 
         Returns:
             (K, H, W) float32, sums over classes are 1. Of networks that predict masks

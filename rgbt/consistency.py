@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Interval as Bounds
 
@@ -16,9 +16,6 @@ from rgbt.checks import InputError
 from rgbt.config.common_options import Modality, NetworkOptions, PredictionFormatOptions, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-
-if TYPE_CHECKING:
-    from rgbt.evaluation.pair_frames import EvaluationData
 
 PREDICTION_OPTIONS = ("pairs", "format", "palette", "prefix", "suffix")
 NETWORK_OPTIONS = ("run", "exported", "runs_dir", "checkpoint", "modality", "trust")
@@ -93,17 +90,17 @@ def main(options: Options, overrides: list[str]) -> int:
     for name in (*WITHOUT_EFFECT[kind], *of_frames):
         if getattr(options, name) != getattr(Options(), name):
             raise InputError(f"'{name}' has no effect on {kind}=... frames={options.frames}.")
-    if not any(item.split("=")[0] == "consistency" for item in overrides):
+    if not any(word.split("=")[0] == "consistency" for word in overrides):
         overrides = ["consistency=views", *overrides]
     if options.export is None:
         _measure(options, overrides)
         return 0
-    from rgbt.evaluation.pair_frames import PairSource
-    from rgbt.evaluation.pair_predictions import write_images
+    from rgbt.evaluation.pairs.frames import composed_pairs
+    from rgbt.evaluation.pairs.others import write_images
     from rgbt.terminal import path_lines, print_rich
 
-    source = PairSource.compose(overrides)
-    listed = write_images(source, options.split, options.frames, options.export)
+    pairs = composed_pairs(overrides, options.split, frames=options.frames)
+    listed = write_images(pairs, options.export)
     written = f"{len(listed.images)} of {len(listed.pairs)} pairs in {options.export.resolve()}"
     print_rich(path_lines([("images", written)]))
     return 0
@@ -111,45 +108,43 @@ def main(options: Options, overrides: list[str]) -> int:
 
 def _measure(options: Options, overrides: list[str]) -> None:
     from rgbt.assembly.load_run import open_named
-    from rgbt.evaluation import consistency_files as files
-    from rgbt.evaluation import temporal_consistency as pairs_of
     from rgbt.evaluation.measure import measurement_of, path_of
-    from rgbt.evaluation.pair_frames import Pairing
-    from rgbt.evaluation.pair_predictions import count_predictions
-    from rgbt.evaluation.predictor import chosen
+    from rgbt.evaluation.pairs import files
+    from rgbt.evaluation.pairs.count import changes_grid, consistency_table, count_pairs
+    from rgbt.evaluation.pairs.frames import composed_pairs, flow_source, pairs_of
+    from rgbt.evaluation.pairs.others import count_predictions
+    from rgbt.evaluation.predict import chosen
     from rgbt.runs.folder import RunFolder
     from rgbt.tables import consistency_grid
     from rgbt.terminal import path_lines, print_rich, rich_table
 
-    split, out = options.split, options.out
-    pairing = Pairing.of(options.frames, options.flow, options.least_used)
-    data: EvaluationData
-    is_own = False
+    split, out, session = options.split, options.out, None
+    flow = flow_source(options.frames, options.flow)
+    how: Any = {"frames": options.frames, "flow": flow, "least_used": options.least_used}
     if options.predictions:
-        folder, exported = options.predictions, options.pairs or options.predictions
-        pairs, data = count_predictions(folder, exported, options, overrides, split, pairing)
-        label = folder.resolve().name
+        pairs = composed_pairs(overrides, split, **how)
+        exported = options.pairs or options.predictions
+        found = count_predictions(options.predictions, exported, options, pairs)
+        label = options.predictions.resolve().name
     else:
-        data = session = open_named(options, overrides)
-        label, wanted = session.label, measurement_of(session, split, chosen(options.modality)[0])
-        is_own = wanted.is_own
-        kept = pairing.pictured(session, split)
-        pairs = pairs_of.count_pairs(session, wanted, pairing, kept)
-    paths = {}
-    for protocol, counts in pairs.counts.items() if out or not options.predictions else ():
-        of = counts.measurement
-        paths[protocol] = out / of.file_name if out else path_of(session, of)
-    table = pairs_of.consistency_table(pairs.counts, data.regions.absent)
-    views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
-    title = f"Consistency of {label} ({data.dataset.name}, {split}; {options.frames}: {views})"
+        session = open_named(options, overrides)
+        pairs = pairs_of(session, split, **how)
+        wanted = measurement_of(session, split, chosen(options.modality)[0])
+        found = count_pairs(session, wanted, pairs, pairs.pictured)
+        label = session.label
+    first = next(iter(found.counts.values()))
+    folder = out if session is None else out or path_of(session, first.measurement).parent
+    table = consistency_table(found.counts, pairs.regions.absent)
+    views = first.partition.partition("-")[2] or "published"
+    title = f"Consistency of {label} ({pairs.dataset.name}, {split}; {options.frames}: {views})"
     print_rich(rich_table(consistency_grid(table, title)))
     least_used = options.least_used if options.frames == "video" else 0.0
-    if pairs.records:
-        print_rich(rich_table(pairs_of.changes_grid(pairs.counts)))
-        print_rich("\n".join(files.flow_sentences(pairs.records, least_used)))
-    if paths:
-        print_rich(path_lines(files.write_pairs(pairs, paths, data.dataset)))
-    if pairing.frames == "virtual" and is_own and not out:
+    if found.records:
+        print_rich(rich_table(changes_grid(found.counts)))
+        print_rich("\n".join(files.flow_sentences(found.records, least_used)))
+    if folder is not None:
+        print_rich(path_lines(files.write_pairs(found, folder, pairs.dataset)))
+    if session is not None and wanted.is_own and options.frames == "virtual" and not out:
         files.add_to_result(RunFolder(session.folder), session, split, table)
 
 

@@ -76,7 +76,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation import measure, tables
     from rgbt.evaluation.corruption import corrupted, requested_corruption
-    from rgbt.evaluation.predictor import chosen
+    from rgbt.evaluation.predict import chosen
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
     from rgbt.terminal import print_rich, rich_table
@@ -96,18 +96,19 @@ def main(options: Options, overrides: list[str]) -> int:
         opened = corrupted(opened, *corruption, split)
     views = record_of(opened.model).views if options.modality == ALL else (view,)
     of_norm = options.batch_norm, options.batch_norm_splits
-    wanted = [measure.measurement_of(opened, split, each, head, *of_norm) for each in views]
-    measure.check(opened, wanted[0])
-    announce_network(opened)
     by_view = {}
-    for each in wanted:
-        files = measure.files_of(opened, each, details, out)
+    for view in views:
+        wanted = measure.measurement_of(opened, split, view, head, *of_norm)
+        if view == views[0]:
+            measure.predictor_of(opened, wanted)  # refuses what cannot be measured
+            announce_network(opened)
+        files = measure.files_of(opened, wanted, details, out)
         counts, note = measure.stored(opened, files), "measured before"
         if len(counts) < len(files):
-            made = measure.measure(opened, each, details)
+            made = measure.measure(opened, wanted, details)
             counts = measure.store(files, made, counts)
             note = f"{len(made.skipped)} images were unreadable" if made.skipped else ""
-        by_view[each.view] = next(iter(counts.values()))
+        by_view[wanted.view] = next(iter(counts.values()))
         print_rich(tables.overview(opened, counts, note))
     if len(by_view) > 1:
         print_rich(rich_table(tables.views_table(by_view, opened.label)))

@@ -44,8 +44,8 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides such as dataset=mfnet dataset.root=/data/MFNet prediction.scales=[1.0]
     """
     from rgbt.assembly.load_run import open_named
-    from rgbt.evaluation.export import ExportRequest, check_out, export, other_sizes
-    from rgbt.evaluation.predictor import Predictor, chosen
+    from rgbt.evaluation.export import check_out, export, other_sizes
+    from rgbt.evaluation.predict import Predictor, chosen
     from rgbt.terminal import path_lines, print_rich
     from rgbt.training.report import announce_network
 
@@ -54,19 +54,17 @@ def main(options: Options, overrides: list[str]) -> int:
     check_out(options.out)
     view, head = chosen(options.modality, options.head)
     session = open_named(options, overrides)
-    Predictor(session, view, head)  # refuses what the network does not have
+    predictor = Predictor(session, view, head)
     session.dataset.names(options.split)
     announce_network(session)
-    request = ExportRequest(
-        out=options.out,
-        view=view,
-        head=head,
-        image_hw=options.image_hw,
-        split=options.split,
+    made, compared, sizes = export(
+        predictor,
+        options.out,
+        options.split,
+        options.image_hw,
         num_images=options.images,
         tolerance=options.tolerance,
     )
-    made, compared, sizes = export(session, request)
     height, width = ("height", "width") if made.dynamic else made.image_hw
     total, fitting = sum(sizes.values()), sizes.get(made.image_hw, 0)
     fits = f"{fitting} of {total} images of {options.split} are {'x'.join(map(str, made.image_hw))}"

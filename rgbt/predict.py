@@ -66,7 +66,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation import images
     from rgbt.evaluation.corruption import corrupted_images, requested_corruption
     from rgbt.evaluation.measure import measurement_of
-    from rgbt.evaluation.predictor import Predictor, chosen
+    from rgbt.evaluation.predict import Predictor, chosen
     from rgbt.terminal import path_lines, print_rich, rich_table
     from rgbt.training.report import announce_network
 

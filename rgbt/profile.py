@@ -15,7 +15,7 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.ranges import BatchSize, Pixels
 
 if TYPE_CHECKING:
-    from rgbt.evaluation.profiled_network import ProfiledNetwork
+    from rgbt.evaluation.profile.networks import ProfiledNetwork
 
 # Settings that change the network, its images, or the device.
 HEEDS = ("model", "scale", "experiment", "dataset", "domains", "recipe", "trainer", "debug")
@@ -52,24 +52,28 @@ def main(options: Options, overrides: list[str]) -> int:
     A network is also chosen by overrides: model=mfnet, +experiment=grbm. Device:
     trainer.accelerator=cuda trainer.threads=2. Weights are random, and no data set is read.
     """
-    from rgbt.evaluation.profile import ProfileSettings, check_out, profile
+    from rgbt.evaluation.profile.rounds import check_out, profile, profile_grid, write_profile
     from rgbt.terminal import path_lines, print_rich, rich_table
 
     if options.out is not None:
         check_out(options.out)
-    settings = ProfileSettings(options.batch_size, options.rounds, options.warmup, options.measure)
-    measured = profile(requested_networks(options, overrides), settings)
-    print_rich(rich_table(measured.grid()))
+    networks, setup = profile(
+        requested_networks(options, overrides),
+        batch_size=options.batch_size,
+        rounds=options.rounds if options.measure else 0,
+        warmup=options.warmup,
+    )
+    print_rich(rich_table(profile_grid(networks, setup)))
     if options.out is not None:
-        measured.write(options.out)
+        write_profile(networks, setup, options.out)
         print_rich(path_lines([("numbers", str(options.out))]))
     return 0
 
 
 def requested_networks(options: Options, overrides: list[str]) -> list[ProfiledNetwork]:
-    """The networks of `models`, `run` or `networks`, or the one that the overrides describe."""
+    """Return the networks of `models`, `run` or `networks`, or the one that overrides describe."""
     from rgbt.config.stored_config import parse_trust
-    from rgbt.evaluation import profiled_network as networks
+    from rgbt.evaluation.profile import networks
 
     image_hw = options.image_hw
     given = [key for key in ("models", "run", "networks") if getattr(options, key)]

@@ -56,8 +56,9 @@ def main(options: Options, overrides: list[str]) -> int:
     runs = split_list(options.run, "runs") if options.run else [""]
     if out and len(runs) > 1:
         raise InputError(f"out={out} is the folder of a single run, but run={options.run}.")
-    for run in filter(None, runs):  # before the first of them is measured
-        find_run(run, options.runs_dir)
+    if options.run:
+        for run in runs:  # before the first of them is measured
+            find_run(run, options.runs_dir)
     # A table of some corruptions does not replace that of all.
     some = [] if options.corruptions == Options.corruptions else corruptions
     for run in runs:
@@ -70,7 +71,7 @@ def main(options: Options, overrides: list[str]) -> int:
         folder = out or path_of(opened, last).parent
         clean = every[0].measurement
         first = split if clean.is_own else clean.file_name.removesuffix(".npz")
-        stem = "_".join(["robustness", first, *(each.name for each in some)])
+        stem = "_".join(["robustness", first, *(corruption.name for corruption in some)])
         write_tables(every, grid, folder / stem)
         print_rich(rich_table(grid))
         print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))

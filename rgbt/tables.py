@@ -83,12 +83,12 @@ class ResultTables:
     consistency: ConsistencyTable | None = None  # where the run measured it
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; NaN becomes None."""
+        """Return plain values; NaN becomes None."""
         return dict(without_nan(asdict(self)))
 
     @classmethod
     def from_json(cls, plain: Mapping[str, Any]) -> ResultTables:
-        """The inverse of `to_json`; raises pydantic's ValidationError, a ValueError."""
+        """Invert `to_json`; raises pydantic's ValidationError, a ValueError."""
         return TypeAdapter(cls).validate_python(plain)
 
 
@@ -102,13 +102,15 @@ class TextTable:
     notes: tuple[str, ...] = ()
 
     def to_markdown(self) -> str:
-        """The table in Markdown, with the title in bold above it and its footnotes below.
+        """Write the table in Markdown, with the title in bold above it and its footnotes below.
 
         Control characters and new lines of names become "?".
         """
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.header)
-        is_text = [place == 0 or any(map(LABEL.match, each)) for place, each in enumerate(columns)]
-        rule = ["---" if each else "---:" for each in is_text]
+        rule = []
+        for number, column in enumerate(columns):
+            is_text = number == 0 or any(map(LABEL.match, column))
+            rule.append("---" if is_text else "---:")
         rows = ([cell.replace("|", "\\|") for cell in row] for row in self.rows)
         lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *rows)]
         title = [f"**{self.title}**", ""] if self.title else []
@@ -118,7 +120,7 @@ class TextTable:
 
 
 def class_grid(tables: ResultTables) -> TextTable:
-    """IoU and accuracy by class over the image, then the class's IoU in every region; percent."""
+    """Make the table of IoU and accuracy by class in the image, then IoU by region; percent."""
     classes, regions = tables.classes, tables.regions
     labels = class_labels(classes.names, classes.unscored)
     scores = zip(classes.ious, classes.accuracies, classes.region_ious, strict=True)
@@ -132,7 +134,7 @@ def class_grid(tables: ResultTables) -> TextTable:
 
 
 def subset_mious(classes: ClassTable) -> dict[str, float]:
-    """Mean IoU of the subsets, and the mean of day and night, which the thesis prints.
+    """Return the mean IoU of subsets, and the mean of day and night, which the thesis prints.
 
     It is not the mIoU of all images, of which the pixels are pooled.
     """
@@ -143,7 +145,7 @@ def subset_mious(classes: ClassTable) -> dict[str, float]:
 
 
 def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
-    """TC and CA by class, one pair of columns per protocol; percent."""
+    """Make the table of TC and CA by class, one pair of columns per protocol; percent."""
     header, columns = ["class"], []
     for protocol in table.tc:
         header += [f"TC {protocol}", f"CA {protocol}"]
@@ -155,7 +157,7 @@ def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
 
 
 def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:
-    """The tables that a run prints at its end."""
+    """Return the tables that a run prints at its end."""
     regions, at = tables.regions, f"{tables.split}, step {tables.step}"
     row = map(percent, (*regions.region_ious, regions.miou))
     header = ("", *(f"IoU{n + 1}" for n in range(len(regions.region_ious))), "mIoU", "Var")
@@ -170,22 +172,22 @@ def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:
 
 
 def class_labels(classes: Sequence[str], unscored: Collection[str]) -> tuple[str, ...]:
-    """Names of classes in tables: "car", or "background (not in means)"."""
+    """Return the names of classes in tables: "car", or "background (not in means)"."""
     return tuple(f"{name} (not in means)" if name in unscored else name for name in classes)
 
 
 def percent(fraction: float) -> str:
-    """A fraction as percent with two decimals, as the papers print it."""
+    """Write a fraction as percent with two decimals, as the papers print it."""
     return number(100.0 * fraction)
 
 
 def number(value: float) -> str:
-    """Two decimals; `ABSENT` for NaN."""
+    """Write a number with two decimals; `ABSENT` for NaN."""
     return ABSENT if math.isnan(value) else f"{value:.2f}"
 
 
 def without_nan(value: Any) -> Any:
-    """`value` with None for every NaN inside, which JSON does not know."""
+    """Replace every NaN inside `value` by None, because JSON does not know it."""
     if isinstance(value, dict):
         return {key: without_nan(child) for key, child in value.items()}
     if isinstance(value, list | tuple):
@@ -194,7 +196,7 @@ def without_nan(value: Any) -> Any:
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows, header first, as CSV; labels that a spreadsheet would execute get an apostrophe."""
+    """Write rows, header first, as CSV; labels that a spreadsheet would execute get an "'"."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_safe(cell) for cell in row] for row in rows)
     return stream.getvalue()

@@ -38,12 +38,12 @@ def print_rich(renderable: RenderableType) -> None:
 
 
 def plain_text(text: str, style: str = "") -> Text:
-    """Text as it is: no markup, no control characters."""
+    """Return text as it is: no markup, no control characters."""
     return Text(without_controls(text), style)
 
 
 def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
-    """Paths, commands and addresses, one "name  path" pair per line."""
+    """List paths, commands and addresses, one "name  path" pair per line."""
     width = max(len(name) for name, _ in paths)
     return plain_text("\n".join(f"{name:<{width}}  {path}" for name, path in paths))
 
@@ -51,13 +51,13 @@ def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
 def result_view(
     tables: ResultTables, folder: Path, links: Sequence[tuple[str, str]]
 ) -> RenderableType:
-    """Tables and paths of a finished run; `links` as its tracker answered."""
+    """Show tables and paths of a finished run; `links` as its tracker answered."""
     paths = path_lines([("run folder", str(folder)), *links])
     return Group(*map(rich_table, result_grids(tables)), paths)
 
 
 def rich_table(grid: TextTable) -> RenderableType:
-    """A grid as a table: labels left and broken where they do not fit, numbers right and whole."""
+    """Lay out a grid: labels left and broken where they do not fit, numbers right and whole."""
     table = Table(box=box.SIMPLE_HEAD)
     for index, (name, *cells) in enumerate(zip(grid.header, *grid.rows, strict=True)):
         is_label = index == 0 or any(map(LABEL.match, cells))

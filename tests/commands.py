@@ -42,7 +42,7 @@ Trained = Callable[..., Path]
 @contextmanager
 def without_pictures() -> Iterator[None]:
     """Pictures of runs are empty files: drawing takes as long as the steps of these tests."""
-    from rgbt.evaluation import consistency_files
+    from rgbt.evaluation.pairs import files
     from rgbt.tracking import pair_pictures
     from rgbt.training import train as training
 
@@ -53,7 +53,7 @@ def without_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("draw_panel", "draw_region_heat"):
             patch.setattr(training, name, draw)
-        for module in (pair_pictures, consistency_files):
+        for module in (pair_pictures, files):
             patch.setattr(module, "draw_pairs", draw)
         yield
 

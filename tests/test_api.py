@@ -87,7 +87,7 @@ def test_load_run_gives_probabilities_and_scores(run: rgbt.Run) -> None:
     np.testing.assert_allclose(shares.sum(0), 1, atol=1e-5)
     np.testing.assert_array_equal(shares.argmax(0), run.predict(sample.rgb, sample.thermal))
     thermals = (sample.thermal, 255 - sample.thermal)
-    by_rgb = [run.probabilities(sample.rgb, each, modality="rgb") for each in thermals]
+    by_rgb = [run.probabilities(sample.rgb, thermal, modality="rgb") for thermal in thermals]
     np.testing.assert_array_equal(*by_rgb)
     assert rgbt.load_run(run.key, runs_dir=run.folder.parent) == run
     assert (run.experiment, run.seed) == ("crm", 0)

@@ -75,8 +75,6 @@ OUTSIDE = {
     "rgbt": set(),
     "sweeps": {
         "analysis",
-        "rgbt.evaluation.profile",
-        "rgbt.evaluation.profiled_network",
         "rgbt.runtime.group",
         "rgbt.runtime.signals",
     }

@@ -66,7 +66,7 @@ def read(folder: Path, name: str) -> Any:
 
 def assert_same_counts(folder: Path, other: Path) -> None:
     for name in (ALIGNED, RELEASED):
-        mine, theirs = (Counts.load(each / name) for each in (folder, other))
+        mine, theirs = (Counts.load(place / name) for place in (folder, other))
         assert np.array_equal(mine.counts, theirs.counts)
         for key in ("names", "night", "classes", "partition", "dataset", "split", "absent"):
             assert getattr(mine, key) == getattr(theirs, key)

@@ -55,7 +55,7 @@ def test_details_of_every_input_are_stored_and_shown_again(
     assert (row["low"], row["high"]) == ("", "")  # 3 images have no interval
 
     refused = ((*words, f"out={tmp_path / 'x.npz'}"), (f"run={folder}", "details=distance"))
-    for each, key in zip(refused, ("out=", "details=distance"), strict=True):
-        code, _, err = call(evaluate.entry, *each)
+    for given, key in zip(refused, ("out=", "details=distance"), strict=True):
+        code, _, err = call(evaluate.entry, *given)
         assert code == 2
         assert_one_sentence(err, key)

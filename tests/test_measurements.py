@@ -187,7 +187,7 @@ def test_counts_of_an_earlier_step_are_no_counts_of_the_finished_run(call: Call,
     stale = replace(counts, measurement=replace(counts.measurement, step=1))
     stale.save(path)
     assert path.relative_to(run).as_posix() not in RunResult(run).measurements()
-    assert "thermal" not in {each.condition for each in evaluations_of(RunResult(run))}
+    assert "thermal" not in {found.condition for found in evaluations_of(RunResult(run))}
     again, out = evaluated(call, run, "modality=thermal")
     assert again == path
     assert "measured before" not in out

@@ -132,10 +132,10 @@ def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixtu
 
 
 def test_csv_formulas_become_text_and_lose_nothing() -> None:
-    text = csv_text([["=head", "n"], *([each, -1.25] for each in FORMULAS + TEXTS)])
+    text = csv_text([["=head", "n"], *([label, -1.25] for label in FORMULAS + TEXTS)])
     _, *rows = csv.reader(io.StringIO(text, newline=""))
     assert text.startswith("'=head,n\n")
-    given = [each.replace("\r", "\n") for each in FORMULAS + TEXTS]
+    given = [label.replace("\r", "\n") for label in FORMULAS + TEXTS]
     for (cell, number), original, raw in zip(rows, given, FORMULAS + TEXTS, strict=True):
         assert cell == (f"'{original}" if raw in FORMULAS else original)
         assert number == "-1.25"

@@ -39,7 +39,7 @@ from rgbt.config.options import Help
 from rgbt.data.files import decode, read_rgb
 from rgbt.data.mfnet import NextFrames
 from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader
-from rgbt.metrics.counting import RegionCounter
+from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.pair_list import ListedPair, read_list
@@ -179,13 +179,13 @@ def panel(
     reader = PredictionReader(dataset.classes, dataset.palette, form)
     palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
     scored = scored_classes(dataset.classes, dataset.unscored)
-    whole = RegionCounter(len(scored), WHOLE)
     for name in names:
         sample, label = labelled_sample(dataset, name)
         painted = [label]
         for method, folder in folders.items():
             painted.append(read_prediction(folder, reader, name, label.shape))
-            score = float(100 * miou(whole(label, painted[-1]).sum(0), "exclude", scored))
+            counts = region_counts(label, painted[-1], len(scored), WHOLE).sum(0)
+            score = float(100 * miou(counts, "exclude", scored))
             numbers.append((name, method.replace("\n", " "), score))
         thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
         pictures.append([sample.rgb, thermal, *(colours(each, palette) for each in painted)])

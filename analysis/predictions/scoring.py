@@ -17,7 +17,7 @@ from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError
 from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, PredictionReader
 from rgbt.dataset import LabelledDataset
-from rgbt.metrics.counting import RegionCounter
+from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.metric import Absent, Partition, Regions
@@ -150,10 +150,7 @@ def score_folder(
     paths, extra = find(folder, names, options.format.affixes)
     reader = PredictionReader(dataset.classes, dataset.palette, options.format)
     maps = MapSum(dataset.num_classes)
-    counters = [
-        RegionCounter(dataset.num_classes, _regions(partition, options.regions))
-        for partition in options.partitions
-    ]
+    partitions = [_regions(partition, options.regions) for partition in options.partitions]
 
     def count(image: str, path: Path) -> tuple[NDArray[np.int64], str]:
         """Counts (partitions, R, K, K), and both sizes if it was resized."""
@@ -165,9 +162,12 @@ def score_folder(
             sizes = f"{_size(prediction)} to {_size(label)}"
             prediction = _resized(prediction, label, path, options.resize)
         maps.add(label, prediction)
-        return np.stack([counter(label, prediction) for counter in counters]), sizes
+        by_partition = [
+            region_counts(label, prediction, dataset.num_classes, regions) for regions in partitions
+        ]
+        return np.stack(by_partition), sizes
 
-    shape = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
+    shape = (len(partitions), len(names), options.regions, *[dataset.num_classes] * 2)
     counts, resized = np.zeros(shape, np.int32), {}
     every = in_threads(count, names, paths, threads=options.threads)
     for index, (matrices, sizes) in enumerate(every):
@@ -186,8 +186,8 @@ def score_folder(
     of |= {"absent": options.absent, "view": "rgbt", "dataset_name": dataset.name}
     shared |= {"names": names, "night": dataset.nights(names)}
     made = []
-    for by_image, counter in zip(counts, counters, strict=True):
-        measurement = Measurement(partition=counter.regions.name, **of)
+    for by_image, regions in zip(counts, partitions, strict=True):
+        measurement = Measurement(partition=regions.name, **of)
         made.append(Counts(counts=by_image, measurement=measurement, **shared))
     return FolderScores(name, tuple(made), summed, extra, resized)
 

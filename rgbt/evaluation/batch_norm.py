@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset, Subset
 from rgbt.engine.progress import progress
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement
 
 Names = tuple[str, ...]
@@ -74,7 +75,7 @@ class BatchMoments:
 
 
 def parts_of_split(dataset: LabelledDataset, wanted: Measurement) -> list[tuple[Names, Names]]:
-    """Names of images that share statistics, and of those that the statistics are computed from.
+    """Return names of images that share statistics, and of those that these are computed from.
 
     Images by day and at night are apart, except for "recomputed" and where the data set does not
     state which images were taken at night.
@@ -82,14 +83,18 @@ def parts_of_split(dataset: LabelledDataset, wanted: Measurement) -> list[tuple[
     names, splits = dataset.names(wanted.split), wanted.statistics_of
     if wanted.statistics == "as trained":
         return [(names, ())]
-    sources = tuple(dict.fromkeys(n for each in splits for n in dataset.names(each))) or names
+    listed: list[str] = []
+    for split in splits:
+        listed += dataset.names(split)
+    sources = tuple(dict.fromkeys(listed)) or names
     dark, dark_sources = dataset.nights(names), dataset.nights(sources)
     if wanted.statistics == "recomputed" or dark is None or dark_sources is None:
         return [(names, sources)]
     parts = []
     for night in sorted(set(dark)):
-        own = tuple(n for n, each in zip(names, dark, strict=True) if each == night)
-        measured = tuple(n for n, each in zip(sources, dark_sources, strict=True) if each == night)
+        own = tuple(n for n, is_dark in zip(names, dark, strict=True) if is_dark == night)
+        times = zip(sources, dark_sources, strict=True)
+        measured = tuple(n for n, is_dark in times if is_dark == night)
         if not measured:
             time = "at night" if night else "by day"
             raise InputError(f"batch_norm_splits={','.join(splits)} has no images {time}.")
@@ -101,40 +106,38 @@ def parts_of_split(dataset: LabelledDataset, wanted: Measurement) -> list[tuple[
 def normalised(
     session: Session, predictor: Predictor, wanted: Measurement, sources: Names
 ) -> Iterator[Names]:
-    """A context in which the network has the wanted statistics of `sources`.
+    """Give the network the wanted statistics of `sources` within this context.
 
-    Gives the names of unreadable images, which are not in the statistics.
+    Yields the names of unreadable images, which are not in the statistics.
     """
     kind = wanted.statistics
     if kind == "as trained":
         yield ()
         return
-    every = (each for each in predictor.model.modules() if isinstance(each, _BatchNorm))
-    norms = [each for each in every if each.running_mean is not None]
+    norms = []
+    for module in predictor.model.modules():
+        if isinstance(module, _BatchNorm) and module.running_mean is not None:
+            norms.append(module)
     if not norms:
         raise InputError(f"batch_norm={kind}: the network has none that can be changed.")
-    stored = [{key: each.clone() for key, each in norm.state_dict().items()} for norm in norms]
+    stored = [deepcopy(norm.state_dict()) for norm in norms]
     moments = [BatchMoments(norm) for norm in norms]
-    skipped: Names = ()
     try:
         with ExitStack() as hooks:
-            for norm, each in zip(norms, moments, strict=True):
-                hooks.enter_context(norm.register_forward_pre_hook(each))
-            if kind != "batch":
-                skipped = _pass(session, predictor, sources)
-                hooks.close()
-                _finish(moments, kind)
-            yield skipped
+            for norm, collector in zip(norms, moments, strict=True):
+                hooks.enter_context(norm.register_forward_pre_hook(collector))
+            if kind == "batch":
+                yield ()
+                return
+            skipped = _pass(session, predictor, sources)
+        if not any(collector.count for collector in moments):
+            raise InputError(f"batch_norm={kind}: no image could be read.")
+        for collector in moments:
+            collector.finish()
+        yield skipped
     finally:
         for norm, before in zip(norms, stored, strict=True):
             norm.load_state_dict(before)
-
-
-def _finish(moments: Sequence[BatchMoments], kind: str) -> None:
-    if not any(each.count for each in moments):
-        raise InputError(f"batch_norm={kind}: no image could be read.")
-    for each in moments:
-        each.finish()
 
 
 def _pass(session: Session, predictor: Predictor, names: Names) -> Names:

@@ -46,11 +46,11 @@ class CorruptedDataset(DatasetWrapper):
                     self._earlier[name] = frames[self.corruption.shown(index, severity)]
 
     def read(self, name: str) -> Sample:
-        """The sample called `name` under the corruption; errors are those of `corrupted`."""
+        """Read the sample called `name` under the corruption; errors are those of `corrupted`."""
         return self.corrupted(name, self.source.read)
 
     def corrupted(self, name: str, read: Callable[[str], Sample]) -> Sample:
-        """What `read` returns of `name`, under the corruption.
+        """Put what `read` returns of `name` under the corruption.
 
         Raises:
             InputError: as `read`; an image that is not of the split, or of another size than the
@@ -75,13 +75,13 @@ class CorruptedDataset(DatasetWrapper):
 
 
 def corruption_of(chosen: ChosenCorruption) -> Corruption:
-    """The object of its settings; InputError: a value that does not fit."""
+    """Build the corruption of these settings; InputError: a value that does not fit."""
     made: Corruption = build({key: v for key, v in chosen.node.items() if key != "seed"})
     return made
 
 
 def severity_of(chosen: ChosenCorruption, text: str) -> float:
-    """The severity that was typed; a ladder of one needs none."""
+    """Return the severity that was typed; none is needed where there is one to choose from."""
     corruption = corruption_of(chosen)
     if not text and len(corruption.severities) == 1:
         return corruption.severities[0]
@@ -92,7 +92,7 @@ def severity_of(chosen: ChosenCorruption, text: str) -> float:
 
 
 def corrupted(session: Session, chosen: ChosenCorruption, severity: float, split: str) -> Session:
-    """`session` that reads `split` under a corruption."""
+    """Return a session that reads `split` under a corruption."""
     dataset = CorruptedDataset(session.dataset, chosen, severity, split)
     kind = dataset.corruption
     if is_own(kind) and not isinstance(kind, OfTime):
@@ -105,7 +105,7 @@ def corrupted(session: Session, chosen: ChosenCorruption, severity: float, split
 def corrupted_images(
     images: ToPredict, session: Session, chosen: ChosenCorruption, severity: float, source: str
 ) -> ToPredict:
-    """`images` of `source` under a corruption; one of time needs a split as source."""
+    """Put `images` of `source` under a corruption; one of time needs a split as source."""
     dataset, read = session.dataset, images.read
     if isinstance(corruption_of(chosen), OfTime):
         check_choice("input", source, dataset.splits)
@@ -118,7 +118,7 @@ def corrupted_images(
 def requested_corruption(
     name: str, severity: str, words: Sequence[str], trust: Sequence[str]
 ) -> tuple[ChosenCorruption, float] | None:
-    """The corruption of ``corruption=`` and its severity; None for "none"."""
+    """Return the corruption of ``corruption=`` and its severity; None for "none"."""
     if name == "none":
         if severity or words:
             raise InputError(f"corruption=none: {['severity', *words][-1]} has no effect.")

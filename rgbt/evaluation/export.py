@@ -14,11 +14,10 @@ from torch.nn import functional as F
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
-from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import collate
 from rgbt.data.new_images import ToPredict, of_split
 from rgbt.engine.progress import progress
-from rgbt.evaluation.predictor import heads_of, view_of
+from rgbt.evaluation.predict import Predictor
 from rgbt.exported.onnx_network import (
     Description,
     ExportedNetwork,
@@ -28,28 +27,14 @@ from rgbt.exported.onnx_network import (
 )
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import record_of
-from rgbt.types import View
 
-NO_TRACKING = "rgbt.tracking.mlflow_store.NoTracking"
+NO_TRACKING = "rgbt.tracking.tracker.Tracking"
 
 # Height and width, pixels.
 Hw = tuple[int, int]
 
 # RGB (B, 3, H, W) and thermal (B, 1, H, W) in [0, 1] to class scores (B, K, H, W).
 ScoresOf = Callable[[Tensor, Tensor], Tensor]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportRequest:
-    """What is exported, and how it is compared."""
-
-    out: Path  # new file
-    view: View | None  # input images; None: those that the network is designed for
-    head: TestedHead | None  # None: as the configuration of the run says
-    image_hw: Hw | Literal["dynamic"] | None  # None: the size of most images after the transform
-    split: str  # whose images are compared
-    num_images: int  # how many of them, the first ones
-    tolerance: float  # see `Comparison.check`
 
 
 @dataclass(frozen=True)
@@ -73,12 +58,25 @@ class Comparison:
 
 
 def export(
-    session: Session, request: ExportRequest
+    predictor: Predictor,
+    out: Path,
+    split: str,
+    image_hw: Hw | Literal["dynamic"] | None = None,
+    num_images: int = 20,
+    tolerance: float = 1e-3,
 ) -> tuple[Description, Comparison, dict[Hw, int]]:
-    """Write the exported network of `session` in float32, unless it gives other scores on the CPU.
+    """Write the network of `predictor` in float32, unless the graph gives other scores on the CPU.
 
     It is compared on images of its size, resized ones where there is none; a dynamic one on images
     of every size, and on one of them resized to `other_sizes`.
+
+    Args:
+        predictor: of the network, from its view and with its head.
+        out: the new file.
+        split: whose images are compared.
+        image_hw: height and width of the images; None: those of most images after the transform.
+        num_images: how many images are compared, the first ones.
+        tolerance: see `Comparison.check`.
 
     Returns:
         what was written, the comparison, and the number of images of the split by their size.
@@ -87,17 +85,17 @@ def export(
         InputError: an existing file, a network with a head per image, or a graph that cannot be
             made or that differs from the network.
     """
-    check_out(request.out)
-    view = view_of(session, request.view)
-    found = of_split(session.dataset, request.split)
-    head = only_head(session, view, request.head, found.names)
+    check_out(out)
+    session = predictor.session
+    found = of_split(session.dataset, split)
+    head = only_head(predictor, found.names)
     by_size = _names_by_size(session, found)
     if not by_size:
-        raise InputError(f"split '{request.split}' of {session.dataset.name} has no image.")
-    is_dynamic = request.image_hw == "dynamic"
+        raise InputError(f"split '{split}' of {session.dataset.name} has no image.")
+    is_dynamic = image_hw == "dynamic"
     most = max(by_size, key=lambda hw: len(by_size[hw]))
-    image_hw = request.image_hw if isinstance(request.image_hw, tuple) else most
-    graph = ScoresOfImages(session.model.cpu().float().eval(), view=view, head=head)
+    size = image_hw if isinstance(image_hw, tuple) else most
+    graph = ScoresOfImages(session.model.cpu().float().eval(), view=predictor.view, head=head)
     description = Description(
         network=type(session.model).__name__,
         run=session.run or session.label,
@@ -105,37 +103,38 @@ def export(
         dataset=session.dataset.name,
         fingerprint=session.dataset.fingerprint(),
         classes=tuple(session.dataset.classes),
-        view=view,
+        view=predictor.view,
         head=head,
         outputs=record_of(session.model).outputs,
-        image_hw=image_hw,
+        image_hw=size,
         dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.
         settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
     )
     content = onnx_bytes(graph, description)
-    network = ExportedNetwork(content, request.out)
+    network = ExportedNetwork(content, out)
     readable = [name for names in by_size.values() for name in names]
-    names = by_size.get(image_hw, readable)
+    names = by_size.get(size, readable)
     if is_dynamic:  # one of each size, then others
-        names = [*dict.fromkeys([*(of_one[0] for of_one in by_size.values()), *readable])]
-    images = [_image(session, found, name) for name in names[: request.num_images]]
+        firsts = [of_one_size[0] for of_one_size in by_size.values()]
+        names = [*dict.fromkeys([*firsts, *readable])]
+    images = [_image(session, found, name) for name in names[:num_images]]
     if is_dynamic:
-        images += [_resized(images[0], hw) for hw in other_sizes(image_hw)]
+        images += [_resized(images[0], hw) for hw in other_sizes(size)]
     else:
-        images = [_resized(pair, image_hw) for pair in images]
+        images = [_resized(pair, size) for pair in images]
     try:
         comparison = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
-        comparison.check(request.tolerance)
+        comparison.check(tolerance)
     except InputError as error:
         if not is_dynamic:
             raise
         raise InputError(
             f"image_hw=dynamic: {description.network} cannot leave its size open: {error}"
         ) from error
-    request.out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(request.out, content)
-    return description, comparison, {hw: len(of_one) for hw, of_one in by_size.items()}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(out, content)
+    return description, comparison, {hw: len(names) for hw, names in by_size.items()}
 
 
 def check_out(out: Path) -> None:
@@ -150,7 +149,7 @@ def check_out(out: Path) -> None:
 def compare(
     reference: ScoresOf, scores_of: ScoresOf, images: list[tuple[Tensor, Tensor]]
 ) -> Comparison:
-    """The network in PyTorch and the exported graph on the same images, at least one.
+    """Compare the network in PyTorch with the exported graph on the same images, at least one.
 
     Of each size the first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal
     (1, 1, H, W).
@@ -173,11 +172,9 @@ def compare(
     return Comparison(len(images), difference, largest, same / total)
 
 
-def only_head(
-    session: Session, view: View, head: TestedHead | None, names: tuple[str, ...]
-) -> str | None:
-    """The one head of the images `names`, None: the only one; InputError where they differ."""
-    heads = set(heads_of(session, view, head)(names))
+def only_head(predictor: Predictor, names: tuple[str, ...]) -> str | None:
+    """Return the one head of the images `names`, None: the only one; InputError: they differ."""
+    heads = set(predictor.heads(names))
     if len(heads) > 1:
         raise InputError(
             "head: an image is predicted with the head of its domain, but an exported graph has "
@@ -187,7 +184,7 @@ def only_head(
 
 
 def other_sizes(image_hw: Hw) -> tuple[Hw, ...]:
-    """Sizes for the comparison of a dynamic graph: lower, narrower and larger, with odd sides."""
+    """Return sizes to compare a dynamic graph at: lower, narrower and larger, with odd sides."""
     height, width = image_hw
     lower, narrower = height * 3 // 4 | 1, width * 2 // 3 | 1
     return (lower, width), (height, narrower), (height * 5 // 4 | 1, width * 5 // 4 | 1)

@@ -34,8 +34,7 @@ from rgbt.data.pseudo_labels import (
     label_path,
 )
 from rgbt.engine.progress import progress
-from rgbt.evaluation.measure import check, legend_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
 from rgbt.metrics.measurement import Measurement
@@ -46,7 +45,7 @@ from rgbt.types import IGNORE, Batch, Sample
 
 
 def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
-    """The images of the options ``input``, or ``rgb`` and ``thermal``."""
+    """Return the images of the options ``input``, or ``rgb`` and ``thermal``."""
     if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
         raise InputError("expected either input=... or both rgb=FILE and thermal=FILE.")
     dataset = session.dataset
@@ -66,26 +65,26 @@ def write_images(
 ) -> str:
     """Write NAME_overlay.png and NAME.png of every image to `out`; how many, and where."""
     images.check_out(out)
-    legend = legend_of(session.dataset)
     written = 0
     with progress() as display:
         task = display.add_task("predicting", total=len(images.names), note="images")
         for sample in images.samples(session.loading.on_error):
             classes = predictor.classes(batch_of(session, sample))[0].cpu().numpy()
             classes = classes if label_map is None else label_map(classes)
-            painted = overlay(sample.rgb, classes, legend)
+            painted = overlay(sample.rgb, classes, session.dataset)
             # A line of a list of images may begin with "../".
             write_png(inside(out / f"{sample.name}_overlay.png", out), painted[..., ::-1])
             write_png(inside(out / f"{sample.name}.png", out), classes)
             written += 1
             display.advance(task)
-    for first in list(images.skipped.values())[:1]:
+    if images.skipped:
+        first = next(iter(images.skipped.values()))
         info(f"{len(images.skipped)} image(s) skipped; the first: {first}")
     return f"{written} images in {out.resolve()}"
 
 
 def batch_of(session: Session, sample: Sample) -> Batch:
-    """One image on the device; one at a time, because images of a folder may have any sizes."""
+    """Put one image on the device; images of a folder may have different sizes."""
     return collate([session.transform.test(sample)], "").to(session.device)
 
 
@@ -98,7 +97,7 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
 
 
 def label_map_of(name: str) -> LabelMap | None:
-    """The file of ``conf/label_map/`` called `name`; None for "none"."""
+    """Build the file of ``conf/label_map/`` called `name`; None for "none"."""
     if name == "none":
         return None
     with composing([]):
@@ -169,15 +168,17 @@ def _predict(
     """Predict and write all images of the split; the part of the manifest that counts them."""
     names = session.dataset.names(wanted.split)
     batches = eval_batches(session.dataset, wanted.split, session.transform, session.loading)
-    predictor = check(session, wanted)
+    head: Any = wanted.head or None
+    predictor = Predictor(session, wanted.view, head)  # type: ignore[arg-type]
     digest = hashlib.sha256()
     counts, sums = np.zeros(IGNORE + 1, np.int64), np.zeros(IGNORE + 1)
     with progress() as display:
         task = display.add_task("predicting", total=len(names), note="images")
         for batch in batches:
             found = predictor.probabilities(batch.to(session.device))
-            confidence, classes = (each.cpu().numpy() for each in best_of(found))
-            for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
+            confidence, classes = best_of(found)
+            by_image = zip(batch.name, confidence.cpu().numpy(), classes.cpu().numpy(), strict=True)
+            for name, sure, ids in by_image:
                 known = ids.astype(np.uint8)
                 known = known if label_map is None else label_map(known)
                 label = np.where(sure < threshold, np.uint8(IGNORE), known)
@@ -193,24 +194,23 @@ def _predict(
     total = int(counts.sum())
     if not total:
         raise InputError(f"split '{wanted.split}': no image could be read.")
-    means = [
-        float(added) / FULL / int(n) if n else None for n, added in zip(counts, sums, strict=True)
-    ]
+    by_class = {}
+    for number, name in enumerate(session.dataset.classes):
+        pixels = int(counts[number])
+        mean = float(sums[number]) / FULL / pixels if pixels else None
+        by_class[name] = {"share": pixels / total, "mean_confidence": mean}
     return {
         "images": len(names) - len(batches.skipped),
         "skipped": sorted(batches.skipped),
         "kept": 1 - int(counts[IGNORE]) / total,
         "mean_confidence": float(sums.sum()) / FULL / total,
-        "by_class": {
-            name: {"share": int(counts[number]) / total, "mean_confidence": means[number]}
-            for number, name in enumerate(session.dataset.classes)
-        },
+        "by_class": by_class,
         "digest": digest.hexdigest(),
     }
 
 
 def weights_digest(model: nn.Module) -> str:
-    """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
+    """Return SHA-256 in hexadecimal over names and bytes of all saved parameters and buffers."""
     digest = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
@@ -219,15 +219,18 @@ def weights_digest(model: nn.Module) -> str:
 
 
 def labels_table(labels: PseudoLabels) -> TextTable:
-    """The share of pixels of each class, and the teacher's confidence in them."""
-    made = labels.manifest
-    rows = [
-        (name, each["share"], each["mean_confidence"]) for name, each in made["by_class"].items()
-    ]
-    kept, total = made["kept"], sum(share * (mean or 0.0) for _, share, mean in rows)
+    """Make the table of the share of pixels of each class, and the teacher's confidence in them."""
+    made, total = labels.manifest, 0.0
+    rows = []
+    for name, found in made["by_class"].items():
+        rows.append((name, found["share"], found["mean_confidence"]))
+        total += found["share"] * (found["mean_confidence"] or 0.0)
+    kept = made["kept"]
     rows += [("kept", kept, total / kept if kept else None)]
     rows += [("all pixels", 1.0, made["mean_confidence"])]
     which = f"confidence of at least {made['threshold']:g}" if made["threshold"] else "every pixel"
     title = f"{made['images']} images of {made['dataset']} {made['split']}, {which}"
-    grid = [(name, percent(a), percent(float("nan") if b is None else b)) for name, a, b in rows]
+    grid = []
+    for name, share, mean in rows:
+        grid.append((name, percent(share), percent(float("nan") if mean is None else mean)))
     return TextTable(title, ("class", "pixels", "confidence"), tuple(grid))

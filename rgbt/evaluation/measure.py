@@ -1,4 +1,4 @@
-"""Measure: predict the images of a split, and count by image, region, label and class.
+"""Predict the images of a split, and count them by image, region, label and class.
 
 Details are counted in the same pass: boundaries, calibration, distance and size of objects.
 """
@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +20,19 @@ from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import AS_TRAINED
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import KnownScenes, LabelledDataset, Subset, background_indices, reader_of
+from rgbt.dataset import KnownScenes, LabelledDataset, Subset, reader_of
 from rgbt.engine.memory import naming_memory
 from rgbt.engine.progress import progress
 from rgbt.evaluation.batch_norm import normalised, parts_of_split
 from rgbt.evaluation.corruption import CorruptedDataset
-from rgbt.evaluation.predictor import Predictor, view_of
-from rgbt.metrics.counting import DetailCounter, RegionCounter
+from rgbt.evaluation.predict import Predictor, view_of
+from rgbt.metrics.counting import detail_counts, region_counts
 from rgbt.metrics.counts import Counts, read_measurement
 from rgbt.metrics.details import SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.measurement import Measurement, Statistics, settings_of
 from rgbt.processes import collected, num_processes
-from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.transforms.maps import nearest
-from rgbt.types import Batch, View
+from rgbt.types import Batch, Sample, View
 
 EVALUATIONS = "evaluations"  # folder, in that of a run, of measurements that it did not end with
 
@@ -41,28 +40,25 @@ EVALUATIONS = "evaluations"  # folder, in that of a run, of measurements that it
 NUM_PANELS = 6
 
 Matrix: TypeAlias = NDArray[np.int64]
+# A sample, and its predicted classes at the size of its label.
+Kept: TypeAlias = tuple[Sample, NDArray[np.uint8]]
+
+# What one process counted: of each image the counts of each kind ("": the confusion matrices of
+# the regions), images for pictures, and names of unreadable images.
+Part: TypeAlias = tuple[dict[str, dict[str, Matrix]], list[Kept], list[str]]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Counts of one split per image and region, those of details by kind, and kept examples.
+    """Counts of one split per image and region, those of details by kind, and kept images.
 
     `skipped` are unreadable images, of the split and of statistics of batch normalisation.
     """
 
     counts: Counts
     details: Mapping[DetailKind, Counts]
-    kept: tuple[PanelExample, ...] = ()
+    kept: tuple[Kept, ...] = ()
     skipped: tuple[str, ...] = ()
-
-
-class Counted(NamedTuple):
-    """What one process has counted: of each image counts (R, K, K), and by kind (R G, M, K)."""
-
-    counts: dict[str, Matrix]
-    details: dict[str, dict[DetailKind, Matrix]]
-    kept: list[PanelExample]
-    skipped: list[str]
 
 
 def measurement_of(
@@ -73,7 +69,7 @@ def measurement_of(
     batch_norm: Statistics = "as trained",
     batch_norm_splits: str = "",
 ) -> Measurement:
-    """The measurement of the network of `session` on its data set, which may be corrupted.
+    """Return what is measured: the network of `session` on its data set, which may be corrupted.
 
     None means: the view and the head of the run's configuration. InputError: a view or splits
     without effect.
@@ -83,11 +79,16 @@ def measurement_of(
         raise InputError(f"{without} with batch_norm={batch_norm}.")
     named = split_list(batch_norm_splits, "batch_norm_splits") if batch_norm_splits else []
     tested = session.domains.tested_head or ""
-    values, dataset = measured_settings(session.spec.plain), session.dataset
-    changed = ["view"] if view_of(session, view) != view_of(session) else []
-    changed += ["head"] if (head or tested) != tested else []
-    values |= reader_settings(dataset)
-    changed += [*session.changed, *(["checkpoint"] if session.checkpoint != "best" else [])]
+    dataset = session.dataset
+    values = measured_settings(session.spec.plain) | reader_settings(dataset)
+    changed = []
+    if view_of(session, view) != view_of(session):
+        changed.append("view")
+    if (head or tested) != tested:
+        changed.append("head")
+    changed += session.changed
+    if session.checkpoint != "best":
+        changed.append("checkpoint")
     if batch_norm != AS_TRAINED:
         changed += ["statistics"]
     else:  # the size of a batch changes nothing
@@ -122,12 +123,15 @@ def measurement_of(
 
 
 def of_partition(wanted: Measurement, partition: str) -> Measurement:
-    """The same measurement, counted in another way: details, or pairs of frames."""
+    """Return the measurement that is counted in another way: details, or pairs of frames."""
     return replace(wanted, partition=partition, changed=(*wanted.changed, "partition"))
 
 
-def check(session: Session, wanted: Measurement) -> Predictor:
-    """The predictor of a measurement; InputError: a view, head or split that there is not."""
+def predictor_of(session: Session, wanted: Measurement) -> Predictor:
+    """Return the predictor of a measurement.
+
+    InputError: a view or a head that the network does not have, or a split that there is not.
+    """
     head: Any = wanted.head or None
     predictor = Predictor(session, wanted.view, head)  # type: ignore[arg-type]
     parts_of_split(session.dataset, wanted)
@@ -154,65 +158,116 @@ def measure(
     Raises:
         InputError: a file cannot be read, or a measurement that does not fit the network or data.
     """
-    predictor = check(session, wanted)
-    counters = _detail_counters(session, details)
-    regions = RegionCounter(len(session.dataset.classes), session.regions)
-    found = Counted({}, {}, [], [])
-    images = session.loading.eval_batch_size
+    predictor, dataset, regions = predictor_of(session, wanted), session.dataset, session.regions
+    for detail in details:
+        if detail.kind in SCENE_KINDS and not isinstance(reader_of(dataset), KnownScenes):
+            raise InputError(f"details={detail.kind}: {dataset.name} has no maps of its scenes.")
+    num_images, num_classes = session.loading.eval_batch_size, len(dataset.classes)
     advice = "Predict windows with prediction.window_hw=[...], or use trainer.accelerator=cpu."
-    if images > 1:
+    if num_images > 1:
         advice = "Set data.eval_batch_size=1, with equal results."
-    memory = naming_memory(session.device, f"an evaluation of {images} images at once", advice)
-    with memory, closing(_batches(session, predictor, wanted, found.skipped)) as batches:
-        for loaded in batches:
-            batch = predictor.counted(loaded)
-            on_device = batch.to(session.device)
-            if "calibration" in counters:
-                classes, confidence = predictor.confident_classes(on_device)
-                sure: Sequence[Tensor | None] = list(confidence.cpu())
-            else:
-                classes, sure = predictor.classes(on_device), [None] * len(batch.name)
-            images_of = zip(batch.name, batch.label, classes.cpu(), sure, strict=True)
-            for name, label, predicted, each in images_of:
-                found.counts[name] = regions(label, predicted)
-                maps = (label, predicted, each)
-                found.details[name] = _details_of(counters, session.dataset, name, maps)
-                kept = [name] if name in keep else []
-                found.kept.extend(_example(session, each, predicted.numpy()) for each in kept)
-    every = joined(collected(found), session.dataset.names(wanted.split))
-    by_kind = {}
-    for kind_of in details:
-        kind = kind_of.kind
-        by_name = {name: counts[kind] for name, counts in every.details.items()}
-        # The sums of calibration are large.
-        dtype = np.int64 if kind == "calibration" else np.int32
-        detailed = of_partition(wanted, kind_of.partition(session.regions.name))
-        by_kind[kind] = counts_of(session.dataset, detailed, by_name, dtype)
-    return Measured(
-        counts=counts_of(session.dataset, wanted, every.counts),
-        details=by_kind,
-        kept=tuple(every.kept),
-        skipped=tuple(every.skipped),
+    memory = naming_memory(session.device, f"an evaluation of {num_images} images at once", advice)
+    counted: dict[str, dict[str, Matrix]] = {}
+    kept: list[Kept] = []
+    skipped: list[str] = []
+    needs_confidence = any(detail.kind == "calibration" for detail in details)
+    predicted = _predicted(session, predictor, wanted, skipped, needs_confidence=needs_confidence)
+    with memory, closing(predicted):
+        for name, label, classes, confidence in predicted:
+            counted[name] = {"": region_counts(label, classes, num_classes, regions)}
+            for detail in details:
+                values = _values(detail.kind, dataset, name, confidence)
+                counted[name][detail.kind] = detail_counts(
+                    detail, label, classes, values, num_classes, regions
+                )
+            if name in keep:
+                kept.append(_with_sample(dataset, name, classes.numpy()))
+    counted, kept, skipped = joined(
+        collected((counted, kept, skipped)), dataset.names(wanted.split)
     )
+    by_kind: dict[DetailKind, Counts] = {}
+    for detail in details:
+        # The sums of calibration are large.
+        dtype = np.int64 if detail.kind == "calibration" else np.int32
+        by_name = {name: matrices[detail.kind] for name, matrices in counted.items()}
+        detailed = of_partition(wanted, detail.partition(regions.name))
+        by_kind[detail.kind] = counts_of(dataset, detailed, by_name, dtype)
+    by_name = {name: matrices[""] for name, matrices in counted.items()}
+    counts = counts_of(dataset, wanted, by_name)
+    return Measured(counts, by_kind, tuple(kept), tuple(skipped))
 
 
-def _batches(
-    session: Session, predictor: Predictor, wanted: Measurement, skipped: list[str]
-) -> Generator[Batch, None, None]:
-    """The batches of a split; while one is used, the network has the wanted statistics.
+def _predicted(
+    session: Session,
+    predictor: Predictor,
+    wanted: Measurement,
+    skipped: list[str],
+    *,
+    needs_confidence: bool,
+) -> Generator[tuple[str, Tensor, Tensor, Tensor | None], None, None]:
+    """Yield name, label, classes and confidence (H, W) of every image of a split.
 
-    Names of unreadable images, also of the statistics, are added to `skipped`.
+    The network has the wanted statistics meanwhile. Names of unreadable images, also of the
+    statistics, are added to `skipped`.
     """
+
+    def predict(batch: Batch) -> tuple[Tensor, Sequence[Tensor | None]]:
+        if not needs_confidence:
+            return predictor.classes(batch).cpu(), [None] * len(batch.name)
+        classes, confidence = predictor.confident_classes(batch)
+        return classes.cpu(), list(confidence.cpu())
+
     for names, sources in parts_of_split(session.dataset, wanted):
         images = Subset(session.dataset, names)
         with normalised(session, predictor, wanted, sources) as unmeasured:
             batches = eval_batches(images, wanted.split, session.transform, session.loading)
-            yield from shown(batches, wanted.split, len(names))
+            for loaded in shown(batches, wanted.split, len(names)):
+                batch = predictor.counted(loaded)
+                classes, confidences = predict(batch.to(session.device))
+                yield from zip(batch.name, batch.label, classes, confidences, strict=True)
         skipped += (*batches.skipped, *unmeasured)
 
 
+def _values(
+    kind: DetailKind, dataset: LabelledDataset, name: str, confidence: Tensor | None
+) -> Any:
+    """The map (H, W) beside label and classes that details of a kind are counted by, if any."""
+    if kind == "calibration":
+        return confidence
+    if kind == "boundary":
+        return None
+    reader = reader_of(dataset)
+    assert isinstance(reader, KnownScenes), "`measure` refuses others"
+    scene = reader.scene_maps(name)
+    return scene.depth_m if kind == "distance" else scene.objects
+
+
+def _with_sample(dataset: LabelledDataset, name: str, classes: NDArray[np.uint8]) -> Kept:
+    """The sample called `name` and its classes, which may be counted at another size."""
+    sample = dataset.read(name)
+    height, width = (sample.thermal if sample.label is None else sample.label).shape
+    return sample, nearest(classes, (height, width))
+
+
+def joined(parts: Sequence[Part], names: Sequence[str]) -> Part:
+    """Join the parts of all processes and domains, in the order of `names`."""
+    position = {name: index for index, name in enumerate(names)}
+    counted: dict[str, dict[str, Matrix]] = {}
+    kept: list[Kept] = []
+    skipped: list[str] = []
+    for counted_part, kept_part, skipped_part in parts:
+        counted |= counted_part
+        kept += kept_part
+        skipped += skipped_part
+    return (
+        {name: counted[name] for name in position if name in counted},
+        sorted(kept, key=lambda image: position[image[0].name]),
+        sorted(dict.fromkeys(skipped), key=lambda name: position.get(name, len(position))),
+    )
+
+
 def shown(batches: Any, what: str, total: int) -> Iterator[Batch]:
-    """The batches, with a progress bar over the images of all processes."""
+    """Yield the batches, with a progress bar over the images of all processes."""
     with progress() as display:
         task = display.add_task(what, total=total, note="images")
         done = 0
@@ -228,7 +283,7 @@ def counts_of(
     by_name: Mapping[str, Matrix],
     dtype: type[np.integer] = np.int32,
 ) -> Counts:
-    """The counts (R, K, K) of each image as those of a split; InputError if there is none."""
+    """Join the counts (R, K, K) of images to those of a split; InputError if there is none."""
     names = tuple(by_name)
     if not names:
         raise InputError(f"split '{wanted.split}' of {dataset.name}: no image could be read.")
@@ -243,7 +298,7 @@ def counts_of(
 
 
 def path_of(session: Session, wanted: Measurement) -> Path:
-    """The file of the counts of a measurement: in the folder of the run, or in evaluations/."""
+    """Return the file of the counts of a measurement: in the run folder, or in evaluations/."""
     is_beside = wanted.is_own or not session.run
     return (session.folder if is_beside else session.folder / EVALUATIONS) / wanted.file_name
 
@@ -251,17 +306,17 @@ def path_of(session: Session, wanted: Measurement) -> Path:
 def files_of(
     session: Session, wanted: Measurement, details: Sequence[Details] = (), out: Path | None = None
 ) -> dict[Path, Measurement]:
-    """The file of a measurement, then those of its details; `out`: instead of `path_of`."""
+    """Return the file of a measurement, then those of its details; `out`: instead of `path_of`."""
     found = {out or path_of(session, wanted): wanted}
-    for each in details:
-        detailed = of_partition(wanted, each.partition(session.regions.name))
-        beside = out and out.with_name(f"{out.stem}-{each.kind}{out.suffix}")
+    for detail in details:
+        detailed = of_partition(wanted, detail.partition(session.regions.name))
+        beside = out and out.with_name(f"{out.stem}-{detail.kind}{out.suffix}")
         found[beside or path_of(session, detailed)] = detailed
     return found
 
 
 def stored(session: Session, files: Mapping[Path, Measurement]) -> dict[Path, Counts]:
-    """The counts that their files hold already, with the scored classes of `session`.
+    """Load the counts that their files hold already, with the scored classes of `session`.
 
     InputError: a file holds another measurement, which is never replaced.
     """
@@ -298,7 +353,7 @@ def _stored(path: Path, wanted: Measurement, images: int) -> Counts | None:
 
 
 def check_replaceable(path: Path, wanted: Measurement) -> bool:
-    """Whether a file holds this measurement, and not of an earlier step of the training.
+    """Return whether a file holds this measurement, and not of an earlier step of the training.
 
     InputError: it holds another one, which is not replaced.
     """
@@ -316,65 +371,8 @@ def check_replaceable(path: Path, wanted: Measurement) -> bool:
     return not differing
 
 
-def _detail_counters(
-    session: Session, details: Sequence[Details]
-) -> dict[DetailKind, DetailCounter]:
-    """A counter of each kind; InputError for scenes that the data set does not know."""
-    dataset, regions, num_classes = session.dataset, session.regions, len(session.dataset.classes)
-    for each in details:
-        if each.kind in SCENE_KINDS and not isinstance(reader_of(dataset), KnownScenes):
-            raise InputError(f"details={each.kind}: {dataset.name} has no maps of its scenes.")
-    return {each.kind: DetailCounter(num_classes, regions, each) for each in details}
-
-
-def _details_of(
-    counters: Mapping[DetailKind, DetailCounter],
-    dataset: LabelledDataset,
-    name: str,
-    maps: tuple[Tensor, Tensor, Tensor | None],
-) -> dict[DetailKind, Matrix]:
-    """The details of one image from its label, classes and confidences (H, W)."""
-    label, classes, confidence = maps
-    further: dict[DetailKind, tuple[Any, ...]] = {"boundary": (), "calibration": (confidence,)}
-    if counters.keys() & set(SCENE_KINDS):
-        reader = reader_of(dataset)
-        assert isinstance(reader, KnownScenes), "otherwise there is no such counter"
-        scene = reader.scene_maps(name)
-        further |= {"distance": (scene.depth_m,), "size": (scene.objects,)}
-    return {kind: count(label, classes, *further[kind]) for kind, count in counters.items()}
-
-
-def joined(parts: Sequence[Counted], names: Sequence[str]) -> Counted:
-    """The parts of all processes and domains together, in the order of `names`."""
-    position = {name: index for index, name in enumerate(names)}
-    counts = {name: found for each in parts for name, found in each.counts.items()}
-    details = {name: found for each in parts for name, found in each.details.items()}
-    kept = [example for each in parts for example in each.kept]
-    skipped = [name for each in parts for name in each.skipped]
-    return Counted(
-        {name: counts[name] for name in names if name in counts},
-        {name: details[name] for name in names if name in details},
-        sorted(kept, key=lambda example: position[example.name]),
-        sorted(dict.fromkeys(skipped), key=lambda name: position.get(name, len(position))),
-    )
-
-
-def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelExample:
-    sample = session.dataset.read(name)
-    label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
-    # Classes may be counted at another size than that of the label file.
-    at_label = nearest(classes, (label.shape[0], label.shape[1]))
-    return PanelExample(name, sample.rgb, sample.thermal, label, at_label)
-
-
-def legend_of(dataset: LabelledDataset) -> Legend:
-    """Classes of a data set and their colours."""
-    palette = np.array(dataset.palette, np.uint8)
-    return Legend(dataset.classes, palette, background_indices(dataset))
-
-
 def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
-    """The first images of a split, half by day and half by night where it holds both."""
+    """Return the first images of a split, half by day and half by night where it holds both."""
     names = dataset.names(split)
     at_night = dataset.nights(names) or (False,) * len(names)
     night = [name for name, dark in zip(names, at_night, strict=True) if dark]

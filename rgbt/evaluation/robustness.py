@@ -10,7 +10,7 @@ from rgbt.config.corruption_node import ChosenCorruption
 from rgbt.engine.progress import progress
 from rgbt.evaluation.corruption import corrupted, corruption_of
 from rgbt.evaluation.measure import files_of, measure, measurement_of, store, stored
-from rgbt.evaluation.predictor import view_of
+from rgbt.evaluation.predict import view_of
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
@@ -29,7 +29,7 @@ SCORES = (MIOU, subset(DAY, MIOU), subset(NIGHT, MIOU))
 def conditions(
     session: Session, split: str, corruptions: Sequence[ChosenCorruption]
 ) -> Iterator[tuple[Session, Measurement]]:
-    """Clean images, single branches if the network decodes them, and every severity."""
+    """Yield clean images, single branches if the network decodes them, and every severity."""
     yield session, measurement_of(session, split)
     known = record_of(session.model).views
     for branch in BRANCHES if view_of(session) == "rgbt" else ():
@@ -44,7 +44,7 @@ def conditions(
 def measure_all(
     session: Session, split: str, corruptions: Sequence[ChosenCorruption], out: Path | None
 ) -> list[Counts]:
-    """The counts of every condition, stored beside the run or in `out`; only missing ones made."""
+    """Return the counts of all conditions, in `out` or beside the run; measure missing ones."""
     every, found = list(conditions(session, split, corruptions)), list[Counts]()
     with progress() as display:
         task = display.add_task("robustness", total=len(every), note="")
@@ -59,7 +59,7 @@ def measure_all(
 
 
 def robustness_grid(every: Sequence[Counts], title: str) -> TextTable:
-    """One line per corruption; level 0 is the clean image, level n the n-th severity."""
+    """Make a table of a line per corruption; level 0 is the clean image, n the n-th severity."""
     scores = [percent(summary(counts, counts.absent)[MIOU]) for counts in every]
     rows: dict[str, list[int]] = {}
     for index, counts in enumerate(every[1:], 1):

@@ -21,11 +21,13 @@ from rgbt.terminal import result_view, rich_table
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
-    """The tables of counts of single frames over `regions`; `label` names their row."""
+    """Make the tables of counts of single frames over `regions`; `label` names their row."""
     absent, scored = counts.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
     region_ious = scores.miou(by_region, absent, scored)
-    parts = {part: scores.miou(sub.whole(), absent, scored) for part, sub in counts.parts().items()}
+    subset_mious = {}
+    for part, images in counts.parts().items():
+        subset_mious[part] = float(scores.miou(images.whole(), absent, scored))
     return ResultTables(
         split=counts.split,
         step=step,
@@ -41,7 +43,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             ious=tuple(map(float, scores.iou(whole, absent))),
             accuracies=tuple(map(float, scores.recall(whole, absent))),
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
-            subset_mious={part: float(value) for part, value in parts.items()},
+            subset_mious=subset_mious,
             unscored=counts.unscored,
             notes=scores.absent_notes(by_region, counts.classes, scored, counts.split, absent),
         ),
@@ -49,25 +51,25 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
 
 
 def label_of(opened: Session, counts: Counts) -> str:
-    """The name of a measurement in tables: the network, the data set and what was changed."""
+    """Name a measurement in tables: the network, the data set and what was changed."""
     of = counts.measurement
     return " · ".join(filter(None, (f"{opened.label} {of.dataset_name}", of.label or of.view)))
 
 
 def overview(opened: Session, files: Mapping[Path, Counts], note: str = "") -> Group:
-    """The tables of counts and their files: of single frames first, then of details."""
+    """Show the tables of counts and their files: of single frames first, then of details."""
     (path, counts), *others = files.items()
     label, head = label_of(opened, counts), cast(TestedHead, counts.measurement.head)
     lines = [("heads", opened.domains.heads_in_words(head))] if head else []
     lines.append(("counts", f"{path} ({note})" if note else str(path)))
-    for file, each in others:
-        details = details_of(each.partition)
+    for file, detailed in others:
+        details = details_of(detailed.partition)
         assert details is not None, "the others are of details"
         lines.append((details.kind, str(file)))
     tables = result_tables(counts, opened.regions, label, opened.step)
     return Group(
         result_view(tables, opened.folder, [line for line in lines if line[1]]),
-        *(rich_table(_details_table(each, label)) for _, each in others),
+        *(rich_table(_details_table(detailed, label)) for _, detailed in others),
     )
 
 
@@ -79,7 +81,7 @@ def _details_table(counts: Counts, label: str) -> TextTable:
 
 
 def views_table(by_view: Mapping[str, Counts], label: str) -> TextTable:
-    """The mIoU by region, one row for each input; counts of single frames."""
+    """Make the table of mIoU by region, a row for each input, of counts of single frames."""
     grid = score_grid(next(iter(by_view.values())))
     rows = [(view, *_numbers(counts, grid.metrics)) for view, counts in by_view.items()]
     return TextTable(f"{label}: {grid.title} and input", ("", *grid.columns), tuple(rows))

@@ -75,7 +75,7 @@ class Description:
 
     @classmethod
     def from_metadata(cls, path: Path, metadata: Mapping[str, str]) -> Description:
-        """The description in the metadata of the file `path`; InputError if there is none."""
+        """Read the description in the metadata of the file `path`; InputError if there is none."""
         own = {k.removeprefix(PREFIX): v for k, v in metadata.items() if k.startswith(PREFIX)}
         try:
             text = json.dumps({key: json.loads(value) for key, value in own.items()})
@@ -97,7 +97,7 @@ class ScoresOfImages(nn.Module):
         self._options: dict[str, Any] = {"views": (view,)} | ({"head": head} if head else {})
 
     def forward(self, rgb: Tensor, thermal: Tensor) -> Tensor:
-        """(B, K, H, W) scores at the size of the images."""
+        """Compute (B, K, H, W) scores at the size of the images."""
         scores: Tensor = self.network(rgb, thermal, **self._options).logits
         return scores
 
@@ -134,15 +134,15 @@ class ExportedNetwork(nn.Module):
         wanted["scores"] = (kind, (len(made.classes), *hw))
         values = (*self._graph.get_inputs(), *self._graph.get_outputs())
         found = {}
-        for each in values:
-            sizes = ("open" if isinstance(size, str) else size for size in each.shape[1:])
-            found[each.name] = each.type, tuple(sizes)
+        for entry in values:
+            sizes = ("open" if isinstance(size, str) else size for size in entry.shape[1:])
+            found[entry.name] = entry.type, tuple(sizes)
         if found != wanted:
             raise InputError(f"{path} has the inputs and outputs {found}, but states {wanted}.")
 
     @classmethod
     def read(cls, path: Path) -> ExportedNetwork:
-        """The network of a file; InputError as of the class, or if there is none."""
+        """Read the network of a file; InputError as of the class, or if there is none."""
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
         if said := disguise(path):
@@ -151,7 +151,7 @@ class ExportedNetwork(nn.Module):
 
     @property
     def record(self) -> Record:
-        """The one view, and the one head, that the graph was made for."""
+        """Return the one view, and the one head, that the graph was made for."""
         made = self.description
         heads = (made.head,) if made.head else ()
         return Record(outputs=made.outputs, views=(made.view,), heads=heads)
@@ -159,7 +159,7 @@ class ExportedNetwork(nn.Module):
     def forward(
         self, rgb: Tensor, thermal: Tensor, *, views: tuple[View, ...] = (), head: str | None = None
     ) -> Output:
-        """Class scores, for arguments as `rgbt.models` says.
+        """Compute class scores, for arguments as `rgbt.models` says.
 
         InputError: images of another size, or another view or head than those of the file.
         """
@@ -190,7 +190,7 @@ def require_packages() -> None:
 
 
 def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
-    """The content of an ONNX file; the size of the batch stays open, of a dynamic one all sizes.
+    """Make the content of an ONNX file; the size of the batch stays open, with `dynamic` all.
 
     Whether the graph is right at other sizes than that of `made` has to be compared: what a network
     makes of its size in Python is as for that one.
@@ -231,8 +231,9 @@ def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
     assert written is not None, "dynamo=True returns the program"
     proto = written.model_proto
     body = proto.graph
-    for each in (body, *body.node, *body.input, *body.output, *body.value_info, *body.initializer):
-        del each.metadata_props[:]  # notes of the exporter, with paths of this machine
+    noted = (body, *body.node, *body.input, *body.output, *body.value_info, *body.initializer)
+    for part in noted:
+        del part.metadata_props[:]  # notes of the exporter, with paths of this machine
     for name, value in asdict(made).items():
         proto.metadata_props.add(key=f"{PREFIX}{name}", value=json.dumps(value))
     content: bytes = proto.SerializeToString()
@@ -242,7 +243,7 @@ def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
 def exported_network(
     network: nn.Module, view: View, image_hw: tuple[int, int], name: str
 ) -> ExportedNetwork:
-    """A network in evaluation mode on the CPU, in onnxruntime; nothing is written.
+    """Put a network in evaluation mode on the CPU into onnxruntime; nothing is written.
 
     InputError: it cannot be exported; `name` is for messages.
     """
@@ -268,11 +269,11 @@ def _check_constants(content: bytes) -> None:
         yield from [message] if isinstance(message, onnx.TensorProto) else []
         for field, value in message.ListFields():
             if field.message_type is not None:
-                for each in [value] if hasattr(value, "ListFields") else value:
-                    yield from tensors(each)
+                for inner in [value] if hasattr(value, "ListFields") else value:
+                    yield from tensors(inner)
 
     model = onnx.load_model_from_string(content)
-    if any(each.data_location == onnx.TensorProto.EXTERNAL for each in tensors(model)):
+    if any(found.data_location == onnx.TensorProto.EXTERNAL for found in tensors(model)):
         raise ValueError("it keeps constants in another file, which is not read")
 
 

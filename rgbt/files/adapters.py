@@ -21,7 +21,7 @@ def adapter_of(constructor: str) -> Path | None:
     package = Path(__file__).resolve().parents[1]
     own = filter(None, os.environ.get("RGBT_CONF", "").split(","))
     folders = [package / "conf", package.parent / "conf"]
-    folders += [Path(each.strip().removeprefix("file://")).expanduser() for each in own]
+    folders += [Path(word.strip().removeprefix("file://")).expanduser() for word in own]
     for folder in folders:
         if name == Path(name).name and (folder / GROUP / name).is_file():
             return folder / GROUP / name

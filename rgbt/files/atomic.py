@@ -36,7 +36,7 @@ def check_writable(setting: str, folder: Path) -> None:
     `setting` is the word that named it, such as "runs_dir=/data", with which the InputError begins.
     """
     places = (folder.absolute(), *folder.absolute().parents)
-    there = next(each for each in places if os.path.exists(each))  # noqa: PTH110 - raises nothing
+    there = next(place for place in places if os.path.exists(place))  # noqa: PTH110 - raises nothing
     try:
         # Permissions do not tell: of a file system that is read-only or full, or of /proc.
         with tempfile.TemporaryDirectory(prefix=".", dir=there):
@@ -54,7 +54,7 @@ def write_atomic(path: Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path, size: Callable[[], int] | None = None) -> Iterator[BinaryIO]:
-    """A file to write, which replaces `path` when the block ends without an exception.
+    """Open a file that replaces `path` when the block ends without an exception.
 
     OSError as of `naming_full_disk`; then `path` is as it was.
     """
@@ -112,7 +112,7 @@ def remove_left_behind(folder: Path, writer: int | None) -> None:
 
 
 def holder_of(path: Path) -> int | None:
-    """Number of the process that held the lock `path` last; None where it does not say."""
+    """Return the number of the process that held the lock `path` last; None: it does not say."""
     found = re.match(r"process (\d+) on ", path.read_text()) if path.is_file() else None
     return None if found is None else int(found[1])
 
@@ -146,7 +146,7 @@ def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether some process, this one included, holds the lock `path`."""
+    """Return whether some process, this one included, holds the lock `path`."""
     if not path.is_file():
         return False
     with path.open() as file:  # shared: two that ask at once take no other for a holder

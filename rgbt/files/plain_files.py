@@ -46,7 +46,7 @@ def check_links(folder: Path) -> None:
 
 
 def inside(path: Path, folder: Path) -> Path:
-    """`path`, if it is in `folder` after all links and ".." are resolved; InputError if not."""
+    """Return `path`, if it is in `folder` after links and ".." are resolved; else InputError."""
     # `os.path`: `Path.resolve` raises for a circle of links.
     found, root = os.path.realpath(path), os.path.realpath(folder)
     if not Path(found).is_relative_to(root):
@@ -55,14 +55,14 @@ def inside(path: Path, folder: Path) -> Path:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Every byte of a regular file; InputError for a pipe, which would be waited for."""
+    """Read every byte of a regular file; InputError for a pipe, which would be waited for."""
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is not a regular file.")
     return path.read_bytes()
 
 
 def disguise(path: Path) -> str:
-    """What a file is that its reader refused: "it is a web page"; "" for an unknown one.
+    """Say what a file is that its reader refused: "it is a web page"; "" for an unknown one.
 
     Servers and git put such files in the place of weights and arrays.
     """
@@ -77,13 +77,14 @@ def disguise(path: Path) -> str:
 
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
-    """`value` as JSON, with the checksum of all other entries as its last entry, "crc32"."""
-    plain = {key: each for key, each in json.loads(json.dumps(value)).items() if key != "crc32"}
+    """Return `value` as JSON, with the checksum of all other entries as its last one, "crc32"."""
+    plain = json.loads(json.dumps(value))
+    plain.pop("crc32", None)
     return {**plain, "crc32": f"{zlib.crc32(json.dumps(plain, sort_keys=True).encode()):08x}"}
 
 
 def sealed_text(text: bytes) -> bytes:
-    """YAML with the checksum of its bytes as a comment, which is its first and its last line.
+    """Put the checksum of a YAML text before and behind it, as a comment.
 
     Damage to one of the lines does not make it a text without a checksum.
     """
@@ -104,7 +105,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, form: Any, advice: str) -> Any:
-    """The content of a sealed JSON file (`parse_json`); a link out of its folder is refused.
+    """Read a sealed JSON file (`parse_json`); a link out of its folder is refused.
 
     Args:
         path: of the file, which exists.
@@ -121,7 +122,7 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
 
 
 def parse_json(text: bytes | str, form: Any, *, is_sealed: bool = False) -> Any:
-    """The value of a JSON text as the type `form`, of which a sealed mapping may have more keys.
+    """Read a JSON text as the type `form`, of which a sealed mapping may have more keys.
 
     ValueError: no JSON in UTF-8, another type than `form`, or a mapping with another checksum or
     none, which is removed.

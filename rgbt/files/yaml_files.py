@@ -60,7 +60,7 @@ def _refused(reason: str, node: yaml.Node) -> yaml.MarkedYAMLError:
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a file; InputError as of `parse_yaml`, or if it is no readable file."""
+    """Read a file; InputError as of `parse_yaml`, or if it is no readable file."""
     try:
         content = read_bytes(path)
         check_seal(content)
@@ -74,7 +74,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Plain values (dict, list, str, int, float, bool, None) of a text from `source`.
+    """Read plain values (dict, list, str, int, float, bool, None) of a text from `source`.
 
     InputError: not one document, a duplicate key, an alias, or a tag of another value.
     """

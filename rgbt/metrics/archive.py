@@ -39,7 +39,7 @@ class Archive:
             np.savez_compressed(file, **arrays)
 
     def load(self, path: Path, build: Callable[[dict[str, Any]], T]) -> T:
-        """What `build` makes of what `save` wrote; InputError: no, damaged or another file."""
+        """Return what `build` makes of what `save` wrote; InputError: a damaged or other file."""
         if not path.is_file():
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         try:
@@ -57,7 +57,7 @@ class Archive:
             raise self._damaged(path, error) from error
 
     def read_text(self, path: Path, name: str, parse: Callable[[str], T]) -> T:
-        """What `parse` makes of the text called `name` of a file, of which nothing else is read."""
+        """Return what `parse` makes of the text called `name` of a file; nothing else is read."""
         try:
             with np.load(path, allow_pickle=False) as stored:
                 if stored.zip.getinfo(f"{name}.npy").file_size > MAX_TEXT:

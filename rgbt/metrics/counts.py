@@ -65,43 +65,43 @@ class Counts:
 
     @property
     def partition(self) -> str:
-        """`Measurement.partition`."""
+        """Return `Measurement.partition`."""
         return self.measurement.partition
 
     @property
     def dataset(self) -> str:
-        """`Measurement.dataset`."""
+        """Return `Measurement.dataset`."""
         return self.measurement.dataset
 
     @property
     def split(self) -> str:
-        """`Measurement.split`."""
+        """Return `Measurement.split`."""
         return self.measurement.split
 
     @property
     def absent(self) -> Absent:
-        """`Measurement.absent`."""
+        """Return `Measurement.absent`."""
         return self.measurement.absent
 
     @property
     def scored(self) -> NDArray[np.bool_]:
-        """(K,): which classes take part in means over classes."""
+        """Return which classes take part in means over classes, (K,)."""
         return scored_classes(self.classes, self.unscored)
 
     def labelled(self) -> NDArray[np.int64]:
-        """(N, R, K): pixels with each label."""
+        """Count the pixels with each label, (N, R, K)."""
         return np.asarray(self.counts.sum(-1, dtype=np.int64))
 
     def by_region(self) -> NDArray[np.int64]:
-        """(R, K, K): all images together."""
+        """Add all images, (R, K, K)."""
         return np.asarray(self.counts.sum(0, dtype=np.int64))
 
     def whole(self) -> NDArray[np.int64]:
-        """(K, K): all images, whole image (the regions cover every pixel once)."""
+        """Add all images and regions, (K, K); the regions cover every pixel once."""
         return np.asarray(self.counts.sum((0, 1), dtype=np.int64))
 
     def select(self, names: Iterable[str]) -> Counts:
-        """The counts of the images called `names`, in that order; InputError: an unknown name."""
+        """Return the counts of images called `names`, in that order; InputError: unknown name."""
         index_of = {name: index for index, name in enumerate(self.names)}
         wanted = tuple(names)
         if missing := set(wanted) - index_of.keys():
@@ -109,7 +109,7 @@ class Counts:
         return self._take([index_of[name] for name in wanted])
 
     def added(self, number: int) -> Counts:
-        """The counts of `number` neighbours each, added; day and night stay apart.
+        """Add the counts of every `number` neighbours; day and night stay apart.
 
         Each is named after its first image and the number of the others: "00196D+9". Scores of all
         images stay equal; intervals draw so many images together.
@@ -125,7 +125,7 @@ class Counts:
         return replace(firsts, counts=np.stack(sums), names=tuple(names))
 
     def parts(self) -> dict[str, Counts]:
-        """Day and night, if the data set distinguishes them and the split holds both."""
+        """Return day and night, if the data set distinguishes them and the split holds both."""
         if self.night is None or len(set(self.night)) < 2:
             return {}
         at_night = np.array(self.night)
@@ -179,7 +179,7 @@ class Counts:
 
 
 def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray[np.bool_]:
-    """(K,): which classes take part in means; ValueError: none, or `unscored` names no class."""
+    """Return which classes are in means, (K,); ValueError: none, or `unscored` names no class."""
     scored = np.array([name not in unscored for name in classes], bool)
     if set(unscored) - set(classes) or not scored.any():
         names = ", ".join(classes), ", ".join(unscored)
@@ -190,15 +190,15 @@ def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray
 def check_same_means(first: Counts, other: Counts) -> None:
     """Refuse to compare counts whose means are over different classes, by InputError."""
     if set(first.unscored) != set(other.unscored):
-        left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
+        left_out, others = (", ".join(counts.unscored) or "no class" for counts in (first, other))
         raise InputError(
-            f"counts whose means leave out {left_out[0]} cannot be compared with those that leave "
-            f"out {left_out[1]}. Evaluate both with the same dataset.unscored."
+            f"counts whose means leave out {left_out} cannot be compared with those that leave "
+            f"out {others}. Evaluate both with the same dataset.unscored."
         )
 
 
 def convention(every: Iterable[Counts]) -> Absent:
-    """The convention for absent classes of all counts; InputError: they were made with both."""
+    """Return the convention for absent classes of all counts; InputError: made with both."""
     found = {counts.absent for counts in every}
     if len(found) > 1:
         raise InputError(
@@ -208,5 +208,5 @@ def convention(every: Iterable[Counts]) -> Absent:
 
 
 def read_measurement(path: Path) -> Measurement:
-    """What a file of counts is of; its counts are not read. InputError: as `Counts.load`."""
+    """Read what a file of counts is of, without the counts; InputError: as `Counts.load`."""
     return ARCHIVE.read_text(path, MEASUREMENT, Measurement.from_json)

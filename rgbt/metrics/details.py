@@ -75,29 +75,29 @@ class Details:
 
     @property
     def bins(self) -> tuple[str, ...]:
-        """Names of the bins of distance and size: "0-10", "10-20", "20-inf"; else ()."""
+        """Return the names of the bins of distance and size: "0-10", "10-20", "20-inf"; else ()."""
         if self.kind not in SCENE_KINDS:
             return ()
         return tuple(f"{_text(low)}-{_text(high)}" for low, high in self._edges())
 
     @property
     def groups(self) -> int:
-        """G, rows of counts of one region."""
+        """Return G, rows of counts of one region."""
         return int(self.setting[0]) if self.kind == "calibration" else len(self.bins) + 1
 
     def measures(self, num_classes: int) -> int:
-        """M, second last dimension of the counts."""
+        """Return M, second last dimension of the counts."""
         return num_classes if self.kind in SCENE_KINDS else 3
 
     def partition(self, regions: str) -> str:
-        """Name of the partition of such counts; `regions` is that of the regions: "ring5"."""
+        """Name the partition of such counts; `regions` is the name of the regions: "ring5"."""
         return "-".join([regions, self.kind, *map(_text, self.setting)])
 
 
 def requested(
     kinds: str, boundary: tuple[float, bool], distances: str, sizes: str
 ) -> tuple[Details, ...]:
-    """The details that options of a command request; `kinds` is a list, "all" or "none".
+    """Return the details that options of a command request; `kinds` is a list, "all" or "none".
 
     `boundary` is the width, and whether the border of the image is an outline; `distances` and
     `sizes` are lists of edges.
@@ -122,7 +122,7 @@ def requested(
 
 
 def details_of(partition: str) -> Details | None:
-    """The details that counts with this partition are; None: other counts."""
+    """Return the details that counts with this partition are; None: other counts."""
     found = re.fullmatch(rf"(.+?)-({'|'.join(KINDS)})-([0-9.e+-]+)", partition)
     if found is None:
         return None
@@ -131,7 +131,7 @@ def details_of(partition: str) -> Details | None:
 
 
 def regions_of(partition: str) -> str:
-    """The name of the regions of a partition: "ring5" of "ring5-boundary-0.02" and of "ring5"."""
+    """Return the regions of a partition: "ring5" of "ring5-boundary-0.02" and of "ring5"."""
     details = details_of(partition)
     return partition if details is None else partition.rpartition(f"-{details.kind}-")[0]
 

@@ -110,22 +110,22 @@ class Measurement:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The fields that decide the counts, as plain values."""
-        return {each.name: getattr(self, each.name) for each in fields(self) if each.compare}
+        """Return the fields that decide the counts, as plain values."""
+        return {key.name: getattr(self, key.name) for key in fields(self) if key.compare}
 
     @property
     def digest(self) -> str:
-        """SHA-256 in hexadecimal of `identity`."""
+        """Return SHA-256 in hexadecimal of `identity`."""
         return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
 
     def differences(self, other: Measurement) -> tuple[str, ...]:
-        """Fields and keys of settings in which two measurements differ, sorted."""
+        """Return the fields and keys of settings in which two measurements differ, sorted."""
         mine, others = self._values(), other._values()
         keys = sorted(mine.keys() | others.keys())
         return tuple(key for key in keys if mine.get(key) != others.get(key))
 
     def unlike(self, other: Measurement) -> tuple[str, ...]:
-        """What differs between two measurements beside their networks, in words: "view: rgb, rgbt".
+        """Say what differs between two measurements beside their networks: "view: rgb, rgbt".
 
         Of one network that is every difference. Of two networks it is what differs from the test
         that each ends with: as it is trained, each may see its images at another size.
@@ -148,12 +148,12 @@ class Measurement:
 
     @property
     def is_own(self) -> bool:
-        """Whether it is what a run ends with, on this split."""
+        """Return whether it is what a run ends with, on this split."""
         return bool(self.run) and not self.changed
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What was changed, in the words of conditions: ("thermal", "noise_rgb", "adabn")."""
+        """Say what was changed, in words of conditions: ("thermal", "noise_rgb", "adabn")."""
         return (*self._names(), *self._changed_settings())
 
     def _names(self) -> list[str]:
@@ -172,12 +172,12 @@ class Measurement:
 
     @property
     def condition(self) -> str:
-        """`words` as one text, or "clean"; the severity is apart."""
+        """Return `words` as one text, or "clean"; the severity is apart."""
         return " ".join(self.words) or CLEAN
 
     @property
     def label(self) -> str:
-        """What was changed, for people: "thermal alone · noise, RGB 16 (grey levels) · AdaBN"."""
+        """Say what was changed: "thermal alone · noise, RGB 16 (grey levels) · AdaBN"."""
         found = [TITLES[self.view]] if "view" in self.changed else []
         found += [self.partition] if "partition" in self.changed else []
         if self.corruption:
@@ -192,7 +192,7 @@ class Measurement:
 
     @property
     def file_name(self) -> str:
-        """The name of its file of counts, for people: "test_thermal_noise-16.npz".
+        """Name its file of counts, for people: "test_thermal_noise-16.npz".
 
         It is never read. With changed settings it ends with digits of the digest.
         """
@@ -215,29 +215,29 @@ class Measurement:
         return [f"{key}={value}" for key, value in self.settings if key in is_shown]
 
     def to_json(self) -> str:
-        """Every field, and the digest."""
-        plain = {each.name: getattr(self, each.name) for each in fields(self)}
+        """Write every field and the digest as JSON."""
+        plain = {key.name: getattr(self, key.name) for key in fields(self)}
         return json.dumps({**plain, "digest": self.digest}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Measurement:
-        """What `to_json` wrote; ValueError: something else, or with another digest."""
+        """Read what `to_json` wrote; ValueError: something else, or with another digest."""
         plain = json.loads(text)
         digest = plain.pop("digest", None)
         found: Measurement = parse_json(json.dumps(plain), cls)
         if found.digest != digest:
             raise ValueError("the measurement does not match its digest")
-        texts = [each for each in vars(found).values() if isinstance(each, str)]
+        texts = [value for value in vars(found).values() if isinstance(value, str)]
         texts += [*found.statistics_of, *found.changed, *found.dataset_words]
         for pair in found.settings:
             texts += pair
-        if any(CONTROL.search(each) for each in texts):
+        if any(CONTROL.search(text) for text in texts):
             raise ValueError("a text of the measurement has control characters")
         return found
 
 
 def dataset_words(overrides: Iterable[str]) -> tuple[str, ...]:
-    """The overrides that make a data set another one: not where it lies, nor how it is scored."""
+    """Return the overrides that make a data set another one, not its folder or scored classes."""
     typed = (word for word in overrides if word.startswith("dataset"))
     return tuple(word for word in typed if not word.startswith(SAME_DATASET))
 
@@ -247,5 +247,5 @@ def _shown(value: Any) -> str:
 
 
 def settings_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Values by dotted key as `Measurement.settings`."""
+    """Turn values by dotted key into `Measurement.settings`."""
     return tuple(sorted((key, json.dumps(value, sort_keys=True)) for key, value in values.items()))

@@ -40,17 +40,17 @@ class Regions:
 
     @property
     def name(self) -> str:
-        """Short name of the partition, stored with the counts: "ring5", "ring9_released_3_4"."""
+        """Name the partition, as stored with the counts: "ring5", "ring9_released_3_4"."""
         suffix = "" if self.aspect in (None, "image") else f"_{self.aspect}"
         return f"{self.partition}{self.regions}{suffix}"
 
     def map(self, image_hw: tuple[int, int]) -> RegionMap:
-        """(H, W) region index of every pixel, read-only; InputError: the image is too small."""
+        """Return the region of every pixel, (H, W) read-only; InputError: too small an image."""
         return _region_map(self, image_hw)
 
 
 def number_of_regions(name: str) -> int:
-    """The regions of a partition with this name (`Regions.name`); 0: another partition."""
+    """Return how many regions a partition of this name has (`Regions.name`); 0: another one."""
     found = re.fullmatch(rf"({'|'.join(get_args(Partition))})(\d+)(_released_3_4)?", name)
     return int(found[2]) if found else 0
 
@@ -69,7 +69,7 @@ def _region_map(metric: Regions, image_hw: tuple[int, int]) -> RegionMap:
 
 
 def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> RegionMap:
-    """Strips: pixel n of a side of length N lies in region ``floor(n R / N)``; R is `regions`.
+    """Cut strips: pixel n of a side of length N is in region ``floor(n R / N)``; R: `regions`.
 
     Source: SpatialSeg, Fig. 2; the release has no strips.
     """
@@ -79,7 +79,7 @@ def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> Reg
 
 
 def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionMap:
-    """Nested centred rectangles of equal area steps; index 0 is the innermost.
+    """Nest centred rectangles of equal area steps; index 0 is the innermost.
 
     The rectangle around regions 0..r-1 has the area ``r H W / R``; R is `regions`.
     Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); `aspect` "image" gives the rectangles the image's
@@ -98,7 +98,7 @@ def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionM
 def ring_rectangle(
     image_hw: tuple[int, int], regions: int, inner: int, aspect: Aspect
 ) -> tuple[slice, slice]:
-    """Rows and columns, half open, of the rectangle around the `inner` innermost regions.
+    """Return rows and columns, half open, of the rectangle around the `inner` innermost regions.
 
     Its sides are ``H sqrt(r / R)`` and ``W sqrt(r / R)`` ("image"), or ``3 s`` and ``4 s`` with
     ``12 s^2 = r H W / R`` ("released_3_4"); bounds are cut to integers as in the SpatialSeg
@@ -114,7 +114,7 @@ def ring_rectangle(
 
 
 def _centred(length: int, numerator: int, denominator: int) -> slice:
-    """``floor((length -+ sqrt(numerator / denominator)) / 2)``, exactly."""
+    """Compute ``floor((length -+ sqrt(numerator / denominator)) / 2)`` exactly."""
     floor_side = math.isqrt(numerator // denominator)
     exact = floor_side * floor_side * denominator == numerator
     ceil_side = floor_side if exact else floor_side + 1

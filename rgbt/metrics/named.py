@@ -79,12 +79,12 @@ class ParsedMetric:
 
     @property
     def needs(self) -> str:
-        """The counts that have the score, in words."""
+        """Return the counts that have the score, in words."""
         return SCORES.get(self.score, (SINGLE,))[0]
 
     @property
     def details(self) -> DetailKind | None:
-        """Kind of details that have the score; None: other counts."""
+        """Return the kind of details that have the score; None: other counts."""
         return self.needs if self.needs in KINDS else None
 
 
@@ -104,7 +104,7 @@ def parse(metric: str) -> ParsedMetric:
 
 
 def value(metric: str, counts: Counts, absent: Absent) -> float:
-    """The score called `metric`: percent 0..100; the variance in squared percent points.
+    """Compute the score called `metric`: percent 0..100; the variance in squared percent points.
 
     NaN: nothing to score. `absent`: how a class without pixels counts, see `rgbt.metrics.scores`.
 
@@ -119,7 +119,7 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
 def values(
     parsed: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
 ) -> NDArray[np.float64]:
-    """(...): the score of many summed counts at once, e.g. one per resample; see also `value`.
+    """Compute a score (...) of many summed counts, e.g. one per resample; see also `value`.
 
     Args:
         parsed: the score; its part (day, night) has been taken by `images_of` before summing.
@@ -138,10 +138,11 @@ def values(
         return np.asarray(mean)
 
     if parsed.score in CHANGES:
-        part, every = (
-            each.sum(-1) if index is None else each[..., index]
-            for each in CHANGES[parsed.score](by_region)
-        )
+        part, every = CHANGES[parsed.score](by_region)
+        if index is None:
+            part, every = part.sum(-1), every.sum(-1)
+        else:
+            part, every = part[..., index], every[..., index]
         return 100.0 * np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
     if parsed.score in PAIR_SCORES:
         return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))
@@ -159,7 +160,7 @@ def values(
 
 
 def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
-    """A score of `PAIR_SCORES` by class (..., K); CA along estimated flow uses labelled pixels."""
+    """Compute one of `PAIR_SCORES` by class (..., K); along estimated flow CA is of labels."""
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
         known = pairs.only_labelled(by_region)
         without = np.isnan(known[..., :1, 0, 0])
@@ -184,7 +185,7 @@ def check_kind(parsed: ParsedMetric, partition: str) -> None:
 
 
 def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
-    """The images that a metric is over: all, or those of day or night; InputError: not both."""
+    """Return the images that a metric is over: all, day or night; InputError: not both."""
     check_kind(parsed, counts.partition)
     if parsed.part is None:
         return counts
@@ -196,13 +197,13 @@ def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
 
 
 def details_of_metric(metric: str) -> DetailKind | None:
-    """The kind of details that a metric name needs; None: other counts, or no metric."""
+    """Return the kind of details that a metric name needs; None: other counts, or no metric."""
     found = NAME.fullmatch(metric)
     return ParsedMetric(metric, None, found["score"] or "").details if found else None
 
 
 def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:
-    """(..., R, G, M, K) -> (..., G, M, K): of the region of a metric, or of all."""
+    """Take the region of a metric, or add all: (..., R, G, M, K) -> (..., G, M, K)."""
     regions = by_region.shape[-4]
     if parsed.region is None:
         return np.asarray(by_region.sum(-4))

@@ -57,12 +57,12 @@ FRACTIONS = {
 
 
 def in_percent(name: str, value: float) -> float:
-    """A score in percent with all its digits; Var and what is no score keep their unit."""
+    """Turn a score into percent with all its digits; Var and what is no score keep their unit."""
     return 100 * value if _is_fraction(name) else value
 
 
 def shown(values: Mapping[str, float]) -> dict[str, float]:
-    """Values as MLflow shows them: scores in percent with two decimals, as the papers print them.
+    """Turn scores into percent with two decimals, as papers print them and MLflow shows them.
 
     Its charts write 0.62 for a fraction, and its tables all sixteen digits.
     """

@@ -32,7 +32,7 @@ class PairList:
     """The content of ``pairs.json``; `complete`: all images are written.
 
     `name` is that of the data set, `dataset` its fingerprint. `views` marks the second frames
-    (`rgbt.evaluation.pair_frames.Pairing`); "published": the published sets of virtual views.
+    (`rgbt.evaluation.pairs.frames.FramePairs`); "published": the published sets of virtual views.
     """
 
     format: Literal["rgbt pairs 1"]
@@ -47,7 +47,7 @@ class PairList:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of all images, each once."""
+        """Return the names of all images, each once."""
         names = (name for pair in self.pairs for name in (pair.first, pair.second))
         return tuple(dict.fromkeys(names))
 
@@ -57,12 +57,12 @@ class PairList:
 
 
 def second_name(first: str, frames: Frames, number: int) -> str:
-    """Name of a second frame; `number` of the set of views, from 0."""
+    """Return the name of a second frame; `number` of the set of views, from 0."""
     return f"{first}_next" if frames == "next" else f"{first}_view{number + 1}"
 
 
 def read_list(place: Path) -> PairList:
-    """The list of pairs in a folder, or at the path of the file itself; InputError: no list."""
+    """Read the list of pairs in a folder, or at the path of the file; InputError: no list."""
     path = place / PAIR_LIST if place.is_dir() else place
     if not path.is_file():
         raise InputError(f"{path} does not exist; name the folder of the export: pairs=FOLDER.")
@@ -75,7 +75,8 @@ def check_same(listed: PairList, wanted: PairList) -> None:
     if not listed.complete:
         raise InputError(f"the export of {listed.name} was interrupted; rerun it, then predict.")
     for key in ("split", "frames", "dataset", "views", "pairs"):
-        exported, counted = (one_line(getattr(each, key)) for each in (listed, wanted))
-        if getattr(listed, key) != getattr(wanted, key):
-            said = f"the pairs were exported from {exported}, but {counted} is counted"
+        exported, counted = getattr(listed, key), getattr(wanted, key)
+        if exported != counted:
+            said = f"the pairs were exported from {one_line(exported)}, but {one_line(counted)}"
+            said += " is counted"
             raise InputError(f"{key}: {said}; give the settings of the export.")

@@ -42,18 +42,18 @@ HEADLINES: dict[Protocol, tuple[str, ...]] = {
 
 
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
-    """The partition of counts of pairs: "aligned3"; `views` marks other than the published."""
+    """Name the partition of counts of pairs: "aligned3"; `views` marks other than the published."""
     return f"{protocol}{sets}-{views}".rstrip("-")
 
 
 def protocol_of(partition: str) -> Protocol | None:
-    """The protocol of a partition; None: the counts are of single frames."""
+    """Return the protocol of a partition; None: the counts are of single frames."""
     found = re.fullmatch(r"([a-z]+)\d+(-[0-9a-f]+)?", partition)
-    return next((each for each in PROTOCOLS if found and found[1] == each), None)
+    return next((known for known in PROTOCOLS if found and found[1] == known), None)
 
 
 def tc(pairs: Matrices, absent: Absent) -> Scores:
-    """Temporal consistency of each class, a fraction 0..1: IoU of the two predictions.
+    """Compute temporal consistency of each class, 0..1: IoU of the two predictions.
 
         |P1 = P2 = c| / |P1 = c or P2 = c|,  of every set alone, then the mean over the S sets
 
@@ -64,7 +64,7 @@ def tc(pairs: Matrices, absent: Absent) -> Scores:
 
 
 def ca(pairs: Matrices, absent: Absent) -> Scores:
-    """Consistent accuracy of each class, as `tc`. Source: Temporal, Fig. 4 (E over A + ... + G).
+    """Compute consistent accuracy, as `tc`. Source: Temporal, Fig. 4 (E over A + ... + G).
 
     |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
     """
@@ -73,7 +73,7 @@ def ca(pairs: Matrices, absent: Absent) -> Scores:
 
 
 def ca_released(pairs: Matrices, absent: Absent) -> Scores:
-    """`ca` as coded (Temporal release), which counts what just two of the three share twice.
+    """Compute `ca` as coded (Temporal release), which counts what two of three share twice.
 
     |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
     """
@@ -82,7 +82,7 @@ def ca_released(pairs: Matrices, absent: Absent) -> Scores:
 
 
 def only_labelled(pairs: Matrices) -> Scores:
-    """The counts without pixels that have no label, of the same shape; NaN where none has one."""
+    """Remove pixels without a label from counts; NaN where no pixel has one."""
     by_set = _by_set(pairs).copy()
     by_set[..., -1, :, :] = 0
     known = by_set.any((-4, -3, -2, -1), keepdims=True)
@@ -90,7 +90,7 @@ def only_labelled(pairs: Matrices) -> Scores:
 
 
 def changed(pairs: Matrices) -> tuple[Scores, Scores]:
-    """Pixels by the class of the first frame: those with another class in the second, and all.
+    """Count pixels by class of the first frame: with another class in the second, and all.
 
     Source: Lai et al. (ECCV 2018), with classes in place of colours. Summed over the S sets.
     """
@@ -100,14 +100,14 @@ def changed(pairs: Matrices) -> tuple[Scores, Scores]:
 
 
 def flickered(triples: Matrices) -> tuple[Scores, Scores]:
-    """Pixels by the class of frame A: those with it in A and C but not in B, and all."""
+    """Count pixels by the class of frame A: those with it in A and C but not in B, and all."""
     rows = _by_set(triples).sum(-4)[..., :-1, :, :]
     outer = np.einsum("...aba->...a", rows)
     return outer - np.einsum("...aaa->...a", rows), rows.sum((-2, -1))
 
 
 def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
-    """What all three say, the sum of the three sizes, that of the overlaps of two: (..., S, K)."""
+    """Count what all three say, the sum of three sizes, and of overlaps of two: (..., S, K)."""
     by_set = _by_set(pairs)
     labelled = by_set[..., :-1, :, :]
     frames = by_set.sum(-3)
@@ -119,7 +119,7 @@ def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
 
 
 def _by_set(pairs: Matrices) -> Scores:
-    """(..., S, K + 1, K, K); float64, whose sums of whole numbers are exact."""
+    """Split counts by set, (..., S, K + 1, K, K); float64: its sums of whole numbers are exact."""
     *leading, rows, classes, _ = pairs.shape
     if rows % (classes + 1):
         raise ValueError(f"pairs: expected S x {classes + 1} rows, got {rows}.")

@@ -20,20 +20,20 @@ class ScoreGrid:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """All names, row by row."""
+        """Return all names, row by row."""
         return tuple(name for _, row in self.rows for name in row)
 
 
 def score_grid(counts: Counts) -> ScoreGrid:
-    """The scores of counts; only their classes, partition and time of day are used."""
+    """Name the scores of counts; only their classes, partition and time of day are used."""
     details, protocol = details_of(counts.partition), protocol_of(counts.partition)
 
     def by_class(scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
-        labels = {name: f"{name} (not in means)" for name in counts.unscored}
-        return [
-            (labels.get(name, name), tuple(names.of_class(name, each) for each in scores))
-            for name in counts.classes
-        ]
+        rows = []
+        for name in counts.classes:
+            label = f"{name} (not in means)" if name in counts.unscored else name
+            rows.append((label, tuple(names.of_class(name, score) for score in scores)))
+        return rows
 
     if protocol is not None:
         scores = HEADLINES[protocol]
@@ -60,7 +60,7 @@ def score_grid(counts: Counts) -> ScoreGrid:
         return ScoreGrid(title, columns, (*rows, ("mean", means)))
     rows = [*by_class(means), ("mean", means)]
     for number in numbers:
-        row = tuple(names.in_region(number, each) for each in means)
+        row = tuple(names.in_region(number, score) for score in means)
         rows.append((f"mean, region {number}", row))
     title = "IoU in percent by distance in metres"
     if details.kind == "size":
@@ -69,11 +69,11 @@ def score_grid(counts: Counts) -> ScoreGrid:
 
 
 def headlines(counts: Counts) -> tuple[str, ...]:
-    """The scores of details that a comparison shows: means, by region or bin."""
+    """Return the scores of details that a comparison shows: means, by region or bin."""
     details = details_of(counts.partition)
     assert details is not None, "counts of details"
     if details.bins:
-        return tuple(f"{details.kind}/{each}" for each in details.bins)
+        return tuple(f"{details.kind}/{bin_name}" for bin_name in details.bins)
     score = names.ECE if details.kind == "calibration" else names.BOUNDARY_MIOU
     return _everywhere(score, _regions(counts, details))
 

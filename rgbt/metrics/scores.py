@@ -34,56 +34,56 @@ ByClass = Callable[[Matrices, Absent], Scores]  # counts -> fractions (..., K)
 
 
 def iou(counts: Matrices, absent: Absent) -> Scores:
-    """Intersection over union of each class: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18)."""
+    """Compute intersection over union: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18)."""
     right, labelled, predicted = _sums(counts)
     return ratio(right, labelled + predicted - right, absent)
 
 
 def recall(counts: Matrices, absent: Absent) -> Scores:
-    """``TP / (TP + FN)`` of each class, "Acc" in the papers' tables."""
+    """Compute ``TP / (TP + FN)`` of each class, "Acc" in the papers' tables."""
     right, labelled, _ = _sums(counts)
     return ratio(right, labelled, absent)
 
 
 def precision(counts: Matrices, absent: Absent) -> Scores:
-    """``TP / (TP + FP)`` of each class."""
+    """Compute ``TP / (TP + FP)`` of each class."""
     right, _, predicted = _sums(counts)
     return ratio(right, predicted, absent)
 
 
 def f1(counts: Matrices, absent: Absent) -> Scores:
-    """``2 TP / (2 TP + FP + FN)``; released (Temporal): NaN for a class that is never found."""
+    """Compute ``2 TP / (2 TP + FP + FN)``; released (Temporal): NaN for a class never found."""
     right, labelled, predicted = _sums(counts)
     return ratio(2 * right, labelled + predicted, absent)
 
 
 def class_mean(scores: Scores, scored: Scored = None) -> Scores:
-    """Mean over the scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
+    """Average scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
     known = ~np.isnan(scores)
     chosen = known if scored is None else known & scored
     return _divide(np.where(chosen, scores, 0.0).sum(-1), chosen.sum(-1), np.nan)
 
 
 def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
-    """Mean over the scored classes of `iou`; that of the tables is of the regions summed."""
+    """Average `iou` over the scored classes; that of the tables is of the regions summed."""
     return _mean(iou, counts, absent, scored)
 
 
 def _mean(score: ByClass, counts: Matrices, absent: Absent, scored: Scored) -> Scores:
-    """Mean of a score over the scored classes; NaN where labels are of one class alone."""
+    """Average a score over the scored classes; NaN where labels are of one class alone."""
     is_alone = _is_alone(counts.sum(-1) > 0, scored, absent)
     return np.where(is_alone, np.nan, class_mean(score(counts, absent), scored))
 
 
 def _is_alone(labelled: NDArray[np.bool_], scored: Scored, absent: Absent) -> NDArray[np.bool_]:
-    """Whether one of several scored classes is labelled, (..., K) -> (...), and others left out."""
+    """Return whether one of several scored classes is labelled, and absent ones left out."""
     labelled = labelled if scored is None else labelled[..., scored]
     several = absent == "exclude" and labelled.shape[-1] > 1
     return np.asarray((labelled.sum(-1) == 1) & several)
 
 
 def variance(region_scores: ArrayLike) -> Scores:
-    """``10^4 / R  sum_r (s_r - mean s)^2``, without NaN regions; fractions (..., R) -> (...).
+    """Compute ``10^4 / R  sum_r (s_r - mean s)^2`` without NaN: fractions (..., R) -> (...).
 
     Source: SpatialSeg, Eq. 19.
     """
@@ -93,19 +93,19 @@ def variance(region_scores: ArrayLike) -> Scores:
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
-    """Share of the valid pixels, of unscored classes too, that are right; NaN without any."""
+    """Compute the share of valid pixels, of unscored classes too, that are right; NaN: none."""
     right, labelled, _ = _sums(counts)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
 
 
 def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
-    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries (..., 3, K)."""
+    """Compute ``|G_d and P_d| / |G_d or P_d|`` of counts of boundaries (..., 3, K)."""
     both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
     return ratio(both, label + predicted - both, absent)
 
 
 def ece(counts: Matrices) -> Scores:
-    """``sum_b |correct_b - confidence_b| / sum_b number_b``, of counts (..., M, 3, K).
+    """Compute ``sum_b |correct_b - confidence_b| / sum_b number_b`` of counts (..., M, 3, K).
 
     That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``, those of unscored classes included;
     NaN without pixels. Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017,
@@ -117,7 +117,7 @@ def ece(counts: Matrices) -> Scores:
 
 
 def object_recall(counts: Matrices) -> Scores:
-    """Recall of each class among the pixels of objects; NaN without an object of that size."""
+    """Compute recall among the pixels of objects; NaN without an object of that size."""
     return recall(counts, "exclude")
 
 
@@ -131,7 +131,7 @@ MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
 
 
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
-    """Every score that is followed over a run, by its name in `rgbt.metrics.names`."""
+    """Compute every score that is followed over a run, by its name in `rgbt.metrics.names`."""
     whole, scored = counts.whole(), counts.scored
     result = _mean_and_variance(counts, absent)
     result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
@@ -153,7 +153,7 @@ def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
 
 
 def absent_rule(absent: Absent) -> str:
-    """How classes without a pixel count, for below a table."""
+    """Say below a table how classes without a pixel count."""
     counted = {"released": "counts as 0", "exclude": "is left out of means"}[absent]
     return f"A class without a pixel {counted} (absent={absent})."
 
@@ -165,7 +165,7 @@ def absent_notes(
     split: str,
     absent: Absent,
 ) -> tuple[str, ...]:
-    """Footnotes of a class table, from (R, K, K) counts: absent scored classes change the means.
+    """Write footnotes of a class table from (R, K, K) counts: absent classes change the means.
 
     Classes that are neither labelled nor predicted, that are predicted only, and that some regions
     lack; and where means are undefined.
@@ -175,18 +175,19 @@ def absent_notes(
     there = labelled | (by_region.sum(-2) > 0)
     gone, unlabelled = ~there.any(0), there.any(0) & ~labelled.any(0)
     lacks = []
-    for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
-        regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
-        lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
-    gone, unlabelled = (np.array(classes)[scored & each].tolist() for each in (gone, unlabelled))
+    for index in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
+        regions = [str(number) for number in (np.flatnonzero(~there[:, index]) + 1)]
+        lacks.append(f"{classes[index]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
     named = {
-        f"absent from the {split} split: {{}} ({counted})": gone,
-        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": unlabelled,
+        f"absent from the {split} split: {{}} ({counted})": np.array(classes)[scored & gone],
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": np.array(classes)[
+            scored & unlabelled
+        ],
         f"absent from some regions: {{}}; {counted} there": lacks,
     }
-    notes = [note.format(", ".join(each)) for note, each in named.items() if each]
+    notes = [note.format(", ".join(found)) for note, found in named.items() if len(found)]
     places = (labelled.any(0), *labelled)  # the whole image, then its regions
-    alone = [place for place, each in enumerate(places) if _is_alone(each, scored, absent)]
+    alone = [n for n, classes_of in enumerate(places) if _is_alone(classes_of, scored, absent)]
     if alone:
         where = ", ".join(f"region {place}" for place in alone)
         where = f"the {split} split" if alone[0] == 0 else where
@@ -195,18 +196,18 @@ def absent_notes(
 
 
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
-    """Right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K) each."""
+    """Count right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K)."""
     right = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
     return right, counts.sum(-1, dtype=np.float64), counts.sum(-2, dtype=np.float64)
 
 
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
-    """``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
+    """Divide ``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
     return _divide(part, whole, 0.0 if absent == "released" else np.nan)
 
 
 def _divide(part: Scores, whole: NDArray[np.generic], undefined: float) -> Scores:
-    """``part / whole``, and `undefined` where the denominator is 0."""
+    """Divide ``part / whole``, with `undefined` where the denominator is 0."""
     quotient: Scores = np.full(np.shape(part), undefined)
     np.divide(part, whole, out=quotient, where=np.asarray(whole) > 0)
     return quotient

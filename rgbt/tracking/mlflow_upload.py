@@ -11,16 +11,15 @@ import getpass
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rgbt.files.plain_files import read_json, write_json
 from rgbt.metrics import names
 from rgbt.runs.folder import (
-    Description,
     MetricLine,
     RunFolder,
     read_provenance,
@@ -30,11 +29,9 @@ from rgbt.runs.folder import (
     shown_key,
 )
 from rgbt.tables import ResultTables, result_grids, subset_mious, without_nan
+from rgbt.tracking.mlflow_client import ExperimentClient
 from rgbt.tracking.mlflow_view import KIND_TAG
 from rgbt.tracking.tracker import Status
-
-if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_store import MlflowStore
 
 # Characters of a run's name (PostgreSQL refuses more), of a parameter and of a tag.
 NAME_LENGTH, PARAM_LENGTH, TAG_LENGTH = 250, 500, 5000
@@ -74,41 +71,8 @@ class UploadState:
     sent: float = 0.0
 
 
-@dataclass(frozen=True)
-class Content:
-    """What is sent of a folder beside its files.
-
-    Attributes:
-        description: name, tags and parameters.
-        identity: tags that are set in the call that makes a run, and by which it is found.
-        process: that began the run, of ``provenance.json``.
-        result: of a finished run.
-    """
-
-    description: Description
-    identity: dict[str, str]
-    process: Mapping[str, Any]
-    lines: list[MetricLine]
-    tables: ResultTables | None
-    result: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, folder: RunFolder) -> Content:
-        """Read from the folder of a run that was described before."""
-        path, description = folder.path, shown_description(folder)
-        assert description is not None, f"{path}: describe() comes before upload()"
-        return cls(
-            description=description,
-            identity={KIND_TAG: "run", "rgbt.key": shown_key(folder), "rgbt.folder": str(path)},
-            process=next(iter(read_provenance(path / "provenance.json")), {}),
-            lines=folder.lines(),
-            tables=read_tables(path),
-            result=read_result(path) or {},
-        )
-
-
 def read_upload_state(folder: RunFolder) -> UploadState | None:
-    """The record of this folder, or None if nothing was sent; InputError where it is damaged."""
+    """Read the record of this folder; None: nothing was sent. InputError: it is damaged."""
     path = folder.path / "mlflow.json"
     advice = "remove the file; the MLflow run is then identified by its key"
     found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
@@ -121,14 +85,14 @@ def write_upload_state(folder: RunFolder, state: UploadState) -> None:
 
 
 def is_sent(folder: RunFolder, state: UploadState) -> bool:
-    """Whether no file changed since the last complete upload; MLflow is not imported."""
+    """Return whether no file changed since the last complete upload, without importing MLflow."""
     files = [*_own_files(folder), *(folder.path / name for name in READ)]
     # The time of a change, not that of the content: a copied file keeps an old one.
     last = max((path.lstat().st_ctime for path in files if path.exists()), default=math.inf)
     return bool(state.run_id) and last <= state.sent
 
 
-def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: Status) -> None:
+def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, status: Status) -> None:
     """Bring the MLflow run of a folder up to date; `state` is changed and written.
 
     Args:
@@ -144,42 +108,68 @@ def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: St
 
     # Taking the lock has written its file: the time by the clock of the folder's file system.
     began = (folder.path / "mlflow.lock").lstat().st_mtime
-    content = Content.of(folder)
-    client, name = store.client, content.description.name[:NAME_LENGTH]
-    run = _run_of(store, folder, state, content)
+    path, description = folder.path, shown_description(folder)
+    assert description is not None, f"{path}: describe() comes before upload()"
+    process = next(iter(read_provenance(path / "provenance.json")), {})  # that began the run
+    lines, tables, result = folder.lines(), read_tables(path), read_result(path) or {}
+    # These tags are set in the call that makes a run, which is found by them.
+    identity = {KIND_TAG: "run", "rgbt.key": shown_key(folder), "rgbt.folder": str(path)}
+    name = description.name[:NAME_LENGTH]
+    run = _run_of(store, folder, state, name, identity, process.get("started"))
     store.check_files(run.info.artifact_uri)
 
-    metrics = list(_metrics(content, state))
+    metrics = list(_metrics(lines, tables, result, state))
     # MLflow refuses to change a parameter.
-    new = {key: v for key, v in content.description.params.items() if key not in run.data.params}
+    new = {key: v for key, v in description.params.items() if key not in run.data.params}
     params = [Param(key, value[:PARAM_LENGTH]) for key, value in new.items()]
-    tags = [RunTag(key, value[:TAG_LENGTH]) for key, value in _tags(content).items() if value]
+    texts = {
+        "mlflow.user": getpass.getuser(),
+        "mlflow.source.type": "LOCAL",
+        "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
+        "rgbt.command": process.get("command", ""),
+        "mlflow.source.git.commit": process.get("git_commit") or "",
+        "rgbt.dataset": result.get("dataset", ""),
+        **identity,
+        **description.tags,
+    }
+    if tables is not None:
+        texts["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
+        texts["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
+    tags = [RunTag(key, value[:TAG_LENGTH]) for key, value in texts.items() if value]
     while metrics or params or tags:  # one call, except for many parameters or metrics
-        client.log_batch(state.run_id, metrics[:BATCH_METRICS], params[:BATCH_PARAMS], tags)
+        store.log_batch(state.run_id, metrics[:BATCH_METRICS], params[:BATCH_PARAMS], tags)
         metrics, params, tags = metrics[BATCH_METRICS:], params[BATCH_PARAMS:], []
-    for line in content.lines:  # a resumed run may be behind what was sent
+    for line in lines:  # a resumed run may be behind what was sent
         state.steps[line.kind] = max(line.step, state.steps.get(line.kind, -1))
     write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
-    for path in (each for each in _own_files(folder) if each.stat().st_ctime > state.sent):
-        parent = path.parent.relative_to(folder.path).as_posix()
-        client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
-    if content.tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
-        client.log_text(state.run_id, json.dumps(artifact_table(content.tables)), TABLE_FILE)
-    client.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
+    for file in _own_files(folder):
+        if file.stat().st_ctime > state.sent:
+            parent = file.parent.relative_to(path).as_posix()
+            store.log_artifact(state.run_id, str(file), None if parent == "." else parent)
+    if tables is not None and (path / "tables.json").stat().st_ctime > state.sent:
+        store.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
+    store.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
     if status not in ("RUNNING", run.info.status):
-        written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
-        end = max(path.stat().st_mtime for path in written if path.exists())
-        client.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
+        written = (path / file for file in ("result.json", "metrics.jsonl", "run.json"))
+        end = max(file.stat().st_mtime for file in written if file.exists())
+        store.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
     state.sent = began
     write_upload_state(folder, state)
 
 
-def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, content: Content) -> Any:
+def _run_of(
+    store: ExperimentClient,
+    folder: RunFolder,
+    state: UploadState,
+    name: str,
+    identity: Mapping[str, str],
+    started: str | None,
+) -> Any:
     """The MLflow run that ``mlflow.json`` names; an unnoted or a new one if it was deleted."""
     from mlflow.exceptions import MlflowException
 
     try:
-        run = store.client.get_run(state.run_id) if state.run_id else None
+        run = store.get_run(state.run_id) if state.run_id else None
         if run is not None and run.info.lifecycle_stage == "active":
             return run
     except MlflowException as error:
@@ -187,14 +177,15 @@ def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, content: 
             raise
     # A process that was killed may have made the run without noting its id. The start keeps runs of
     # one key apart that were trained again.
-    first = content.process.get("started")
-    seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
-    start, tags, name = round(1000 * seconds), content.identity, content.description.name
-    found = store.client.search_runs([store.experiment_id], f"attributes.start_time = {start}")
+    seconds = time.time() if started is None else datetime.fromisoformat(started).timestamp()
+    start = round(1000 * seconds)
+    found = store.search_runs([store.experiment_id], f"attributes.start_time = {start}")
     # Compared here: MLflow's search cannot quote every path. A store of one folder moves with it.
-    known = {key: tags[key] for key in tags if not (store.files and key == "rgbt.folder")}
-    run = next((each for each in found if known.items() <= each.data.tags.items()), None)
-    run = run or store.client.create_run(store.experiment_id, start, tags, name[:NAME_LENGTH])
+    known = dict(identity)
+    if store.files:
+        del known["rgbt.folder"]
+    same = [run for run in found if known.items() <= run.data.tags.items()]
+    run = same[0] if same else store.create_run(store.experiment_id, start, dict(identity), name)
     state.run_id, state.steps, state.sent = run.info.run_id, {}, 0.0
     write_upload_state(folder, state)
     return run
@@ -206,7 +197,12 @@ def _own_files(folder: RunFolder) -> list[Path]:
     return [path for path in found if path.is_file() and path.resolve() == path]
 
 
-def _metrics(content: Content, state: UploadState) -> Iterator[Any]:
+def _metrics(
+    lines: Sequence[MetricLine],
+    tables: ResultTables | None,
+    result: Mapping[str, Any],
+    state: UploadState,
+) -> Iterator[Any]:
     """Finite values of new lines, each with the time of its line, and what no line holds.
 
     The latter are the IoU over the regions (the step is the region's number), and scores of pairs
@@ -214,8 +210,7 @@ def _metrics(content: Content, state: UploadState) -> Iterator[Any]:
     """
     from mlflow.entities import Metric
 
-    every, tables = content.lines, content.tables
-    new = [line for line in every if line.step > state.steps.get(line.kind, -1)]
+    new = [line for line in lines if line.step > state.steps.get(line.kind, -1)]
     # The compare page draws the metric that came first: scores before losses.
     for line in sorted(new, key=lambda line: ("test", "val", "train").index(line.kind)):
         # The pages draw bars over runs for a metric that has step 0 only, else a line over steps.
@@ -223,41 +218,30 @@ def _metrics(content: Content, state: UploadState) -> Iterator[Any]:
         finite = {name: value for name, value in line.values.items() if math.isfinite(value)}
         for name, value in names.shown(finite).items():
             yield Metric(prefix + name, value, round(1000 * line.time), step)
-    now = round(1000 * every[-1].time) if every else 0
+    now = round(1000 * lines[-1].time) if lines else 0
     regions = tables.regions.region_ious if tables is not None and tables.split == "test" else ()
     for region, iou in enumerate(regions, start=1):
         if math.isfinite(iou):
             yield Metric(names.REGION_PROFILE, round(100 * iou, 2), now, region)
-    known = {name for line in every if line.kind == "test" for name in line.values}
-    for kind, prefix, sent in (("val", "val/", set()), ("test", "", known)):
-        scores = {name: v for name, v in (content.result.get(kind) or {}).items() if v is not None}
-        pairs = {n: v for n, v in scores.items() if n.split("/")[0] in (names.TC, names.CA)}
-        for name, value in names.shown(pairs).items() if pairs else ():
-            if name not in sent:
-                yield Metric(f"{prefix}{name}", value, now, 0)
+    known = {name for line in lines if line.kind == "test" for name in line.values}
+    for name, value in _pair_scores(result, "val").items():
+        yield Metric(f"val/{name}", value, now, 0)
+    for name, value in _pair_scores(result, "test").items():
+        if name not in known:
+            yield Metric(name, value, now, 0)
 
 
-def _tags(content: Content) -> dict[str, str]:
-    """Tags of a run by name; those without a value are not sent."""
-    tables = content.tables
-    tags = {
-        "mlflow.user": getpass.getuser(),
-        "mlflow.source.type": "LOCAL",
-        "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
-        "rgbt.command": content.process.get("command", ""),
-        "mlflow.source.git.commit": content.process.get("git_commit") or "",
-        "rgbt.dataset": content.result.get("dataset", ""),
-        **content.identity,
-        **content.description.tags,
-    }
-    if tables is not None:
-        tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
-        tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
-    return tags
+def _pair_scores(result: Mapping[str, Any], kind: str) -> dict[str, float]:
+    """The scores of pairs of frames in a result, as MLflow shows them."""
+    pairs = {}
+    for name, score in (result.get(kind) or {}).items():
+        if score is not None and name.split("/")[0] in (names.TC, names.CA):
+            pairs[name] = score
+    return names.shown(pairs)
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
-    """The result as columns and rows in percent (Var: its own unit) for MLflow's table view.
+    """Make columns and rows in percent (Var: its own unit) for MLflow's table view.
 
     That view groups by the first column, which must be unique, and compares the second between
     runs; it shows few rows on a screen, so summaries come first.

@@ -19,7 +19,7 @@ KIND_TAG = "kind"
 
 
 def view_tags() -> dict[str, str]:
-    """Tags of an experiment that hold its views: runs, means over seeds, and tables."""
+    """Return tags of an experiment that hold its views: runs, means over seeds, and tables."""
     groups = [{"mode": "tag", "groupByData": "rgbt.group"}]
     seeds = {"aggregateFunction": "average", "groupByKeys": groups}
     runs, others = (f"tags.`{KIND_TAG}` {sign} 'run'" for sign in ("=", "!="))
@@ -32,7 +32,7 @@ def view_tags() -> dict[str, str]:
 
 
 def view_path(experiment_id: str) -> str:
-    """Where the view of all runs opens, relative to the server's address.
+    """Return the path of the view of all runs, relative to the server's address.
 
     Without ``workflowType`` MLflow 3 opens its pages for generative models, which have no scores.
     """

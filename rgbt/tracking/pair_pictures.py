@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rgbt.dataset import LabelledDataset
 from rgbt.tracking import pictures
-from rgbt.tracking.pictures import Image, Legend, colours, overlay
+from rgbt.tracking.pictures import Image, colours, overlay, palette_of
 from rgbt.types import IGNORE
 
 AGREES = (235, 235, 235)
@@ -36,7 +37,7 @@ class PairExample:
     flow: NDArray[np.float32] | None = None
 
     def motion(self) -> tuple[Image, ...]:
-        """The flow as a picture: hue is its direction, strength its length; black is not used."""
+        """Paint the flow: hue is its direction, strength its length; black is not used."""
         if self.flow is None:
             return ()
         from matplotlib.colors import hsv_to_rgb
@@ -52,7 +53,7 @@ class PairExample:
         return (picture,)
 
     def difference(self) -> Image:
-        """(H, W, 3) uint8: red where the two predictions differ, grey where nothing is compared."""
+        """Paint (H, W, 3) red where the two predictions differ, grey where nothing is compared."""
         picture = np.empty((*self.seen.shape, 3), np.uint8)
         picture[:] = AGREES
         picture[self.followed != self.second] = DIFFERS
@@ -63,13 +64,14 @@ class PairExample:
 COLUMNS = ("frame", "its prediction", "second frame", "its prediction", "first, brought there")
 
 
-def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> None:
+def draw_pairs(examples: Sequence[PairExample], dataset: LabelledDataset, path: Path) -> None:
     """Write a PNG, one row per scene (at least one), as in Temporal, Figs. 1 and 6."""
     rows = []
-    for each in examples:
-        frames = ((each.first_rgb, each.first), (each.second_rgb, each.second))
-        shown = [image for rgb, classes in frames for image in (rgb, overlay(rgb, classes, legend))]
-        shown.append(colours(np.where(each.seen, each.followed, IGNORE), legend.palette))
-        rows.append((each.name, (*shown, *each.motion(), each.difference())))
+    for scene in examples:
+        shown = [scene.first_rgb, overlay(scene.first_rgb, scene.first, dataset)]
+        shown += [scene.second_rgb, overlay(scene.second_rgb, scene.second, dataset)]
+        followed = np.where(scene.seen, scene.followed, IGNORE)
+        shown.append(colours(followed, palette_of(dataset)))
+        rows.append((scene.name, (*shown, *scene.motion(), scene.difference())))
     moving = ("motion (black: not used)",) if examples and examples[0].flow is not None else ()
-    pictures.draw_columns(rows, (*COLUMNS, *moving, "differ (grey: not seen)"), legend, path)
+    pictures.draw_columns(rows, (*COLUMNS, *moving, "differ (grey: not seen)"), dataset, path)

@@ -1,22 +1,21 @@
 """Draw the pictures of a run: qualitative panel, region heat map, label overlay.
 
-Data first (arrays and small frozen dataclasses), drawing after. Matplotlib is imported when
-something is drawn and never opens a window.
+Matplotlib is imported when something is drawn and never opens a window.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rgbt.dataset import LabelledDataset, background_indices
 from rgbt.files.atomic import replacing
-from rgbt.types import IGNORE
+from rgbt.types import IGNORE, Sample
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,28 +32,13 @@ LETTER_INCHES = 0.07
 HALF_SPAN = 15.0
 
 
-@dataclass(frozen=True)
-class PanelExample:
-    """One image of a qualitative panel; its labels may have another size."""
-
-    name: str
-    rgb: Image  # (H, W, 3)
-    thermal: Image  # (H, W)
-    label: Image  # (H', W'), class index or 255
-    prediction: Image  # (H', W'), class index
-
-
-@dataclass(frozen=True)
-class Legend:
-    """K class names and their colours."""
-
-    names: tuple[str, ...]
-    palette: Image  # (K, 3), RGB
-    background: tuple[int, ...]  # classes that overlays do not paint
+def palette_of(dataset: LabelledDataset) -> Image:
+    """Return the colours of the classes of a data set, (K, 3) RGB."""
+    return np.array(dataset.palette, np.uint8)
 
 
 def colours(label: Image, palette: Image) -> Image:
-    """Classes (H, W) uint8 as colours (H, W, 3) of a palette (K, 3); 255 is `IGNORED_COLOUR`.
+    """Paint classes (H, W) uint8 in colours of a palette (K, 3): (H, W, 3); 255: `IGNORED_COLOUR`.
 
     Raises:
         ValueError: a label is neither below K nor 255.
@@ -67,40 +51,39 @@ def colours(label: Image, palette: Image) -> Image:
     return np.asarray(table[label])
 
 
-def overlay(rgb: Image, label: Image, legend: Legend, alpha: float = 0.6) -> Image:
-    """The image (H, W, 3) with classes (H, W) painted over it; background and 255 stay unpainted.
+def overlay(rgb: Image, label: Image, dataset: LabelledDataset, alpha: float = 0.6) -> Image:
+    """Paint classes (H, W) over an image (H, W, 3); background classes and 255 stay unpainted.
 
     out = round((1 - alpha) * rgb + alpha * palette[label])
     """
-    mixed = (1.0 - alpha) * rgb + alpha * colours(label, legend.palette)
-    unpainted = np.isin(label, (*legend.background, IGNORE))[..., None]
+    mixed = (1.0 - alpha) * rgb + alpha * colours(label, palette_of(dataset))
+    unpainted = np.isin(label, (*background_indices(dataset), IGNORE))[..., None]
     return np.where(unpainted, rgb, np.rint(mixed)).astype(np.uint8)
 
 
-def draw_panel(examples: Sequence[PanelExample], legend: Legend, path: Path) -> None:
-    """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below."""
-    rows = [
-        (
-            each.name,
-            (
-                each.rgb,
-                np.repeat(each.thermal[..., None], 3, axis=2),
-                colours(each.label, legend.palette),
-                colours(each.prediction, legend.palette),
-            ),
-        )
-        for each in examples
-    ]
-    draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), legend, path)
+def draw_panel(
+    examples: Sequence[tuple[Sample, Image]], dataset: LabelledDataset, path: Path
+) -> None:
+    """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below.
+
+    An example is a sample and its predicted classes, at the size of its label.
+    """
+    palette, rows = palette_of(dataset), []
+    for sample, prediction in examples:
+        label = np.full_like(prediction, IGNORE) if sample.label is None else sample.label
+        thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
+        painted = colours(label, palette), colours(prediction, palette)
+        rows.append((sample.name, (sample.rgb, thermal, *painted)))
+    draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), dataset, path)
 
 
 def draw_columns(
     rows: Sequence[tuple[str, Sequence[Image]]],
     titles: Sequence[str],
-    legend: Legend,
+    dataset: LabelledDataset,
     path: Path,
 ) -> None:
-    """Write a PNG of `rows` (name, one (H, W, 3) picture per column), with the classes below."""
+    """Write a PNG of `rows`, (name, one (H, W, 3) picture per column), with the classes below."""
     height, width = rows[0][1][0].shape[:2]
     cell_w = 3.0
     cell_h = cell_w * height / width
@@ -118,7 +101,7 @@ def draw_columns(
 
     patches = [
         Patch(facecolor=colour / 255.0, edgecolor="grey", label=name)
-        for name, colour in zip(legend.names, legend.palette, strict=True)
+        for name, colour in zip(dataset.classes, palette_of(dataset), strict=True)
     ]
     figure.legend(
         handles=patches, loc="outside lower center", ncols=min(len(patches), 9), fontsize=8
@@ -137,17 +120,10 @@ def _broken(name: str, letters: int) -> str:
     return "\n".join(lines)
 
 
-@dataclass(frozen=True)
-class RegionHeat:
-    """The data of the region heat map."""
-
-    title: str
-    region_map: NDArray[np.int64]  # (H, W), region of every pixel: 0..R-1
-    ious: tuple[float, ...]  # R fractions; NaN regions stay white
-
-
-def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple[int, int] | None]:
-    """(row, column) inside each region where a number is easy to read; None for empty regions.
+def number_places(
+    region_map: NDArray[np.integer], num_regions: int
+) -> list[tuple[int, int] | None]:
+    """Return (row, column) in each region where a number is easy to read; None: it is empty.
 
     The pixel nearest to the region's mean, above the middle row where that is in another region.
     """
@@ -168,7 +144,7 @@ def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple
 
 
 def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
-    """Ends of the colour scale in percent, equally far from the mean region.
+    """Return the ends of the colour scale in percent, equally far from the mean region.
 
     At least `HALF_SPAN`, so that pictures of most runs can be compared. Without a score: around 50.
     """
@@ -179,20 +155,29 @@ def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
     return mean - half, mean + half
 
 
-def draw_region_heat(heat: RegionHeat, path: Path) -> None:
-    """Write a PNG: the regions coloured by their IoU, the IoU in each, a colour bar."""
-    values = 100.0 * np.asarray(heat.ious, np.float64)[heat.region_map]
+def draw_region_heat(
+    title: str, region_map: NDArray[np.integer], ious: Sequence[float], path: Path
+) -> None:
+    """Write a PNG: the regions coloured by their IoU, the IoU in each, a colour bar.
+
+    Args:
+        title: of the picture.
+        region_map: (H, W), region of every pixel: 0..R-1.
+        ious: R fractions; NaN regions stay white.
+        path: of the PNG.
+    """
+    values = 100.0 * np.asarray(ious, np.float64)[region_map]
     height, width = values.shape
-    low, high = colour_limits(heat.ious)
-    size = 9 if len(heat.ious) <= 5 else 7  # nine rings are narrow
+    low, high = colour_limits(ious)
+    size = 9 if len(ious) <= 5 else 7  # nine rings are narrow
     figure = _figure(6.4, 5.4 * height / width + 0.5)
     axis = figure.subplots()
     shown = axis.imshow(values, cmap="viridis", vmin=low, vmax=high)
     axis.set(xticks=[], yticks=[])
-    axis.set_title(heat.title, fontsize=10, wrap=True)
+    axis.set_title(title, fontsize=10, wrap=True)
     # Thin lines where the region changes, so that equal neighbours stay two regions.
-    axis.contour(heat.region_map, np.arange(0.5, len(heat.ious)), colors="white", linewidths=0.6)
-    for place, iou in zip(number_places(heat.region_map, len(heat.ious)), heat.ious, strict=True):
+    axis.contour(region_map, np.arange(0.5, len(ious)), colors="white", linewidths=0.6)
+    for place, iou in zip(number_places(region_map, len(ious)), ious, strict=True):
         if place is not None:
             text = "-" if np.isnan(iou) else f"{100 * iou:.1f}"
             box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}

@@ -15,7 +15,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.runs.folder import REPLACED, RunFolder, is_finished, runs_dir_of, runs_in
 from rgbt.terminal import info
-from rgbt.tracking.mlflow_store import EXPERIMENT, MlflowTracking, StoreBusyError, reason_of
+from rgbt.tracking.mlflow_store import EXPERIMENT, MlflowTracking, reason_of
 from rgbt.tracking.tracker import Status
 
 
@@ -35,7 +35,7 @@ class Options:
 
 
 def folders_of(options: Options) -> list[RunFolder]:
-    """The run folders that are requested; InputError where there is none."""
+    """Return the run folders that are requested; InputError where there is none."""
     if options.run is None:
         runs_dir = options.runs_dir or Path()
         replaced = runs_dir / REPLACED
@@ -66,7 +66,7 @@ def main(options: Options, overrides: list[str]) -> int:
                 raise
             failed += 1
             info(f"{folder.path} was not sent ({reason_of(error)}).")
-            if isinstance(error, StoreBusyError | TimeoutError) or not tracking.is_open:
+            if isinstance(error, TimeoutError) or not tracking.is_open:
                 break  # waited for once, not for every run
     sys.stdout.write(f"open MLflow  {tracking.ui_command()}\n")
     return 1 if failed else 0

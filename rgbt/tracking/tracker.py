@@ -1,4 +1,4 @@
-"""The interface of trackers (`rgbt.tracking.mlflow_store` has the implementations)."""
+"""Track no run: only its folder is written. `rgbt.tracking.mlflow_store` shows runs in MLflow."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ Link = tuple[str, str]
 
 
 class Tracking:
-    """Base class, which only describes the run; no call raises for a store that is away."""
+    """Describes the run in its folder, which `rgbt sync` can send later (``tracking=none``).
+
+    It is also the base of other trackers; no call raises for a store that is away.
+    """
 
     def start(self, folder: RunFolder, description: Description) -> None:
         """Start or continue the run of `folder`; no step has been done yet by this process."""
@@ -34,5 +37,5 @@ class Tracking:
         self.finish("FINISHED")
 
     def links(self) -> list[Link]:
-        """The command that shows the run, one line."""
+        """Return the command that shows the run, one line."""
         return []

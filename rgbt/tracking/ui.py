@@ -25,7 +25,8 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.files.plain_files import check_links, inside
 from rgbt.runs.provenance import without_passwords
-from rgbt.tracking.mlflow_store import ARTIFACTS, EXPERIMENT, SQLITE, MlflowTracking, reason_of
+from rgbt.tracking.mlflow_client import ARTIFACTS, SQLITE
+from rgbt.tracking.mlflow_store import EXPERIMENT, MlflowTracking, reason_of
 from rgbt.tracking.mlflow_view import view_path
 
 HOST = "127.0.0.1"

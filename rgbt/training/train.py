@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from omegaconf import OmegaConf
 from torch import nn
 
@@ -25,13 +24,12 @@ from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.measure import (
     Measured,
-    legend_of,
     measure,
     measurement_of,
     panel_names,
     path_of,
 )
-from rgbt.evaluation.predictor import view_of
+from rgbt.evaluation.predict import view_of
 from rgbt.evaluation.tables import result_tables
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
@@ -52,7 +50,7 @@ from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runtime.signals import deferred
 from rgbt.tables import ConsistencyTable, without_nan
 from rgbt.terminal import info
-from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
+from rgbt.tracking.pictures import draw_panel, draw_region_heat
 from rgbt.tracking.tracker import Tracking
 from rgbt.training.report import (
     announce_training,
@@ -329,8 +327,8 @@ class Training:
         found: dict[str, tuple[ConsistencyTable, dict[str, float]]] = {}
         if not session.consistency.sets:
             return found
-        from rgbt.evaluation import temporal_consistency as frames
-        from rgbt.evaluation.pair_frames import Pairing
+        from rgbt.evaluation.pairs import count as frames
+        from rgbt.evaluation.pairs.frames import pairs_of
         from rgbt.tracking.pair_pictures import draw_pairs
 
         for kind in session.consistency.splits:
@@ -341,7 +339,7 @@ class Training:
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
                 wanted = measurement_of(session, split)
-                pairs = frames.count_pairs(session, wanted, Pairing("virtual"), keep)
+                pairs = frames.count_pairs(session, wanted, pairs_of(session, split), keep)
             except InputError as error:
                 # The training is done: an error of an extra evaluation must not lose it.
                 info(f"{error} Consistency was not measured; see `rgbt consistency`.")
@@ -350,7 +348,7 @@ class Training:
             table = frames.consistency_table(pairs.counts, session.regions.absent)
             found[kind] = table, frames.consistency_values(table)
             if pairs.kept:
-                draw_pairs(pairs.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
+                draw_pairs(pairs.kept, session.dataset, self.folder.figure_path("pairs"))
         return found
 
     def _test(
@@ -377,13 +375,14 @@ class Training:
         if not result.kept:
             info("no image of the panel could be read, so no pictures were drawn.")
             return values
-        draw_panel(result.kept, legend_of(session.dataset), self.folder.figure_path("panel"))
-        heat = RegionHeat(
-            title=f"{name}: IoU by region, {session.dataset.name} {tables.split}",
-            region_map=session.regions.map(result.kept[0].label.shape).astype(np.int64),
-            ious=tables.regions.region_ious,
+        draw_panel(result.kept, session.dataset, self.folder.figure_path("panel"))
+        height, width = result.kept[0][1].shape
+        draw_region_heat(
+            f"{name}: IoU by region, {session.dataset.name} {tables.split}",
+            session.regions.map((height, width)),
+            tables.regions.region_ious,
+            self.folder.figure_path("regions"),
         )
-        draw_region_heat(heat, self.folder.figure_path("regions"))
         return values
 
     def _by_other_head(self, counts: list[Counts], step: int) -> dict[str, float]:

@@ -17,7 +17,7 @@ from rgbt.config.plain_command import exit_code
 from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.requirements import Record
 from tests.commands import Call, Trained, assert_one_sentence, losses, short, train
 

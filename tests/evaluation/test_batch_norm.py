@@ -18,7 +18,7 @@ from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.batch_norm import normalised
 from rgbt.evaluation.measure import measure, measurement_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement, Statistics
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
@@ -64,7 +64,7 @@ def wanted(session: Session, kind: Statistics = "as trained", *splits: str) -> M
 def pixels(session: Session, *names: str) -> NDArray[np.float64]:
     """(pixels, 4): red, green, blue and thermal of all pixels of some images, in [0, 1]."""
     samples = [session.dataset.read(name) for name in names]
-    images = [np.dstack([each.rgb, each.thermal]).reshape(-1, 4) for each in samples]
+    images = [np.dstack([sample.rgb, sample.thermal]).reshape(-1, 4) for sample in samples]
     return np.concatenate(images) / 255
 
 
@@ -72,7 +72,7 @@ def pixels(session: Session, *names: str) -> NDArray[np.float64]:
 def test_statistics_are_those_of_all_pixels_in_any_order(session: Session, size: int) -> None:
     session = replace(session, loading=replace(session.loading, eval_batch_size=size))
     model, predictor = session.model, Predictor(session)
-    before = {name: each.clone() for name, each in model.state_dict().items()}
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     names = tuple(SPLITS["train"])
     expected = pixels(session, *names)
     for sources in (names, names[::-1]):
@@ -81,8 +81,8 @@ def test_statistics_are_those_of_all_pixels_in_any_order(session: Session, size:
             assert model.norm.running_var.numpy() == pytest.approx(expected.var(0), abs=1e-6)
             assert torch.equal(model.unused.running_var, torch.ones(2))
             assert not model.norm.training
-        for name, each in model.state_dict().items():
-            assert torch.equal(each, before[name])
+        for name, tensor in model.state_dict().items():
+            assert torch.equal(tensor, before[name])
 
 
 TRAIN_DAYS, TRAIN_NIGHTS = ([n for n in SPLITS["train"] if n[-1] == t] for t in "DN")

@@ -65,9 +65,9 @@ def test_draws_differ_by_name_and_seed() -> None:
     data = corrupted(Recorded(), "occluded:thermal", 0.5, *words)
     other = corrupted(Recorded(), "occluded:thermal", 0.5, *words, "corruption.seed=1")
     hidden = [data.read(NAMES[0]), data.read(NAMES[1]), other.read(NAMES[0])]
-    first, *others = [each.thermal == 0 for each in hidden]
+    first, *others = [sample.thermal == 0 for sample in hidden]
     assert first.mean() == 0.5
-    assert not any(np.array_equal(first, each) for each in others)
+    assert not any(np.array_equal(first, other_one) for other_one in others)
 
 
 @pytest.mark.parametrize("name", ["noise", "frozen", "delayed", "removed:rgb"])
@@ -92,7 +92,7 @@ def test_frames_of_two_sizes_are_refused() -> None:
 def test_lowest_severity_changes_the_named_image(name: str) -> None:
     lowest = corruption_of(choose_corruption(name)).severities[0]
     data = corrupted(Recorded(), name, lowest)
-    clean, found = ([source.read(each) for each in NAMES] for source in (Recorded(), data))
+    clean, found = ([source.read(name) for name in NAMES] for source in (Recorded(), data))
     same_rgb, same_thermal = (
         all(np.array_equal(getattr(a, i), getattr(b, i)) for a, b in zip(clean, found, strict=True))
         for i in ("rgb", "thermal")
@@ -153,7 +153,7 @@ def test_file_may_name_corruptions_alone(
 def test_choose_corruptions() -> None:
     assert len(choose_corruptions("all", [])) == 14
     both = choose_corruptions("blur:rgb, frozen", ["corruption.seed=2"])
-    assert [(each.name, each.node["seed"]) for each in both] == [
+    assert [(chosen.name, chosen.node["seed"]) for chosen in both] == [
         ("blur_rgb_seed-2", 2),
         ("frozen_seed-2", 2),
     ]

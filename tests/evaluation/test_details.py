@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from rgbt.assembly.session import Session, open_session
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
-from rgbt.evaluation.measure import Counted, Measured, joined, measure, measurement_of
+from rgbt.evaluation.measure import Measured, joined, measure, measurement_of
 from rgbt.metrics.details import DEFAULTS, KINDS, SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.named import value
 from rgbt.processes import collected, rank
@@ -59,7 +59,7 @@ def session_of(data: Path, kind: type[MFNet] = MFNet) -> Session:
 
 
 def measured(session: Session, *kinds: DetailKind) -> Measured:
-    details = [Details(each, DEFAULTS[each]) for each in kinds]
+    details = [Details(kind, DEFAULTS[kind]) for kind in kinds]
     return measure(session, measurement_of(session, "test"), details)
 
 
@@ -103,17 +103,17 @@ def test_calibration_counts_are_those_of_the_probabilities(data: Path) -> None:
 NAMES = ("b", "a", "d", "c")
 
 
-def _merged() -> tuple[list[str], dict[str, dict[DetailKind, np.ndarray]]]:
-    own = NAMES[rank() :: 2]
-    counted = {name: np.full((1, 2, 2), ord(name)) for name in own}
-    detailed = {name: {"boundary": np.full((1, 3, 2), ord(name))} for name in own}
-    merged = joined(collected(Counted(counted, detailed, [], [])), NAMES)
-    return list(merged.counts), merged.details
+def _joined() -> tuple[dict[str, dict[str, np.ndarray]], list[str]]:
+    counted = {name: {"": np.full((1, 2, 2), ord(name))} for name in NAMES[rank() :: 2]}
+    skipped = ["outside", *NAMES[1 - rank() :: 2]]
+    merged, _, skipped = joined(collected((counted, [], skipped)), NAMES)
+    return merged, skipped
 
 
 @pytest.mark.slow
-def test_processes_together_have_details_of_images_in_order() -> None:
-    for names, detailed in run_in_processes(_merged, 2):
-        assert names == list(detailed) == list(NAMES)
-        for name, kinds in detailed.items():
-            assert np.array_equal(kinds["boundary"], np.full((1, 3, 2), ord(name)))
+def test_processes_together_have_counts_of_images_in_order() -> None:
+    for counted, skipped in run_in_processes(_joined, 2):
+        assert list(counted) == list(NAMES)
+        assert skipped == [*NAMES, "outside"]
+        for name, matrices in counted.items():
+            assert np.array_equal(matrices[""], np.full((1, 2, 2), ord(name)))

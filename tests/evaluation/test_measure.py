@@ -36,7 +36,7 @@ def test_details_leave_the_counts_that_are_there(
 
 def test_every_difference_counts_between_measurements_of_one_network() -> None:
     """Of two networks, each may be tested on other regions as it is trained."""
-    test, val = (measurement(run="a", split=each) for each in ("test", "val"))
+    test, val = (measurement(run="a", split=split) for split in ("test", "val"))
     rings = replace(val, partition="ring9")
     assert test.unlike(val) == ("split: test, val",)
     assert test.unlike(rings) == ("partition: ring5, ring9", "split: test, val")

@@ -17,7 +17,7 @@ from rgbt.config.compose import compose
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.measure import measurement_of
-from rgbt.evaluation.predictor import Predictor, heads_of, view_of
+from rgbt.evaluation.predict import Predictor, heads_of, view_of
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
 from rgbt.types import Batch, Output
@@ -134,6 +134,8 @@ def test_images_that_are_read_otherwise_are_another_measurement(tmp_path: Path) 
         )
     )
     assert measurement_of(one, "test") == measurement_of(same, "test")
-    images = [each.dataset.read(each.dataset.names("test")[0]).thermal for each in (one, other)]
+    images = [
+        session.dataset.read(session.dataset.names("test")[0]).thermal for session in (one, other)
+    ]
     assert (images[0] != images[1]).any()
     assert measurement_of(one, "test") != measurement_of(other, "test")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from torch.nn import functional as F
 
 from rgbt import profile as command
 from rgbt.checks import InputError
-from rgbt.evaluation.profile import ProfileSettings, count_flops, profile, ratio_of
-from rgbt.evaluation.profiled_network import (
+from rgbt.evaluation.profile.networks import (
     PreparedNetwork,
     ProfiledNetwork,
     check_networks,
@@ -25,6 +23,7 @@ from rgbt.evaluation.profiled_network import (
     from_overrides,
     with_onnx,
 )
+from rgbt.evaluation.profile.rounds import count_flops, profile, profile_grid, write_profile
 from tests.commands import Call, assert_one_sentence
 
 ENTRY = command.entry
@@ -52,16 +51,6 @@ def test_count_flops_of_attention_includes_both_products(mode: type) -> None:
         assert count_flops(lambda: F.scaled_dot_product_attention(q, k, k)) == 2 * (
             2 * (2 * 3) * 7 * 5 * 4
         )
-
-
-def test_ratio_interval_has_the_order_statistics_of_the_binomial() -> None:
-    # P(at most 5 of 20 below the median) = 0.0207, of 6: 0.0577; so the 6th and the 15th of 20.
-    times = [float(n) for n in range(1, 21)]
-    assert ratio_of(times, [1.0] * 20) == (10.5, 6.0, 15.0)
-    assert ratio_of(times[:6], [1.0] * 6) == (3.5, 1.0, 6.0)
-    middle, *ends = ratio_of(times[:5], [2.0] * 5)
-    assert middle == 1.5
-    assert all(map(math.isnan, ends))
 
 
 def test_from_overrides_uses_paper_scale_and_no_data_set() -> None:
@@ -113,7 +102,7 @@ def test_prepared_network_predicts_the_class_of_every_pixel() -> None:
     classes = network.predict()
     assert (classes.shape, classes.dtype) == ((2, 50, 70), torch.uint8)
     model: nn.Module = tiny().model.build()
-    assert network.parameters == sum(each.numel() for each in model.parameters())
+    assert network.parameters == sum(weights.numel() for weights in model.parameters())
 
 
 def test_profile_measures_every_network_once_in_each_round(
@@ -127,24 +116,26 @@ def test_profile_measures_every_network_once_in_each_round(
         return predict(self)
 
     monkeypatch.setattr(PreparedNetwork, "predict", watched)
-    measured = profile([tiny(), tiny("cmx_tiny")], ProfileSettings(rounds=6, warmup=1))
+    networks, setup = profile([tiny(), tiny("cmx_tiny")], rounds=6, warmup=1)
     assert calls[:4] == ["mfnet_tiny"] * 2 + ["cmx_tiny"] * 2  # counted, and warmed up
     rounds = [tuple(calls[start : start + 2]) for start in range(4, len(calls), 2)]
     assert sorted(map(sorted, rounds)) == [["cmx_tiny", "mfnet_tiny"]] * 6
     assert len(set(rounds)) == 2
-    ours, theirs = measured.networks.to_dict("records")
+    ours, theirs = networks.to_dict("records")
     pairs = zip(theirs["milliseconds"], ours["milliseconds"], strict=True)
     assert theirs["ratio"] == pytest.approx(np.median([a / b for a, b in pairs]))
     median = np.median(ours["milliseconds"])
-    assert ours["first_quartile_ms"] <= ours["latency_ms"] <= ours["third_quartile_ms"]
     assert ours["latency_ms"] == pytest.approx(median)
     assert ours["images_per_second"] == pytest.approx(1000 / median)
-    assert (measured.setup["kind"], measured.setup["threads"]) == ("cpu", 1)
-    measured.write(tmp_path / "profile.json")
+    assert (setup["kind"], setup["threads"]) == ("cpu", 1)
+    grid = profile_grid(networks, setup)
+    assert grid.header[-3:] == ("latency, ms", "images/s", "ratio")
+    assert (grid.rows[0][-1], grid.rows[1][-1]) == ("1.000", f"{theirs['ratio']:.3f}")
+    write_profile(networks, setup, tmp_path / "profile.json")
     first, second = json.loads((tmp_path / "profile.json").read_text())["networks"]
     assert (first["name"], first["image_hw"], first["peak_memory"]) == ("mfnet_tiny", "64x96", None)
     assert len(second["milliseconds"]) == 6
-    measured.write(tmp_path / "profile.csv")
+    write_profile(networks, setup, tmp_path / "profile.csv")
     _, line = csv.DictReader((tmp_path / "profile.csv").open())
     assert float(line["ratio"]) == pytest.approx(theirs["ratio"])
     assert (line["peak_memory"], line["torch"]) == ("", torch.__version__)
@@ -156,9 +147,9 @@ def test_profile_on_a_gpu_measures_allocated_memory() -> None:
     words = ["model=mfnet_tiny", "trainer.accelerator=cuda"]
     sizes = {"a": (64, 64), "b": (480, 640)}
     networks = [from_overrides(name, words, hw) for name, hw in sizes.items()]
-    measured = profile(networks, ProfileSettings(rounds=6, warmup=2))
-    first, second = measured.networks.to_dict("records")
-    assert measured.setup["device"] == torch.cuda.get_device_name()
+    measured, setup = profile(networks, rounds=6, warmup=2)
+    first, second = measured.to_dict("records")
+    assert setup["device"] == torch.cuda.get_device_name()
     assert first["peak_memory"] > 4 * first["parameters"]
     assert second["peak_memory"] - first["peak_memory"] > 4 * 4 * (480 * 640 - 64 * 64)
 
@@ -170,9 +161,9 @@ def test_command_counts_without_measurement(call: Call, tmp_path: Path) -> None:
     assert code == 0, err
     assert "GFLOPs" in printed
     assert "latency" not in printed
-    for each in json.loads(out.read_text())["networks"]:
-        assert each["flops"] > 0
-        assert (each["latency_ms"], each["milliseconds"]) == (None, [])
+    for network in json.loads(out.read_text())["networks"]:
+        assert network["flops"] > 0
+        assert (network["latency_ms"], network["milliseconds"]) == (None, [])
 
 
 @pytest.mark.parametrize(
@@ -196,7 +187,7 @@ def test_command_refuses_wrong_input(call: Call, words: tuple[str, ...], key: st
 @pytest.mark.slow
 def test_onnx_is_measured_beside_the_network() -> None:
     network = tiny(image_hw=(32, 48))
-    made = profile(with_onnx([network]), ProfileSettings(rounds=2, warmup=1)).networks
+    made, _ = profile(with_onnx([network]), rounds=2, warmup=1)
     assert list(made["name"]) == ["mfnet_tiny", "mfnet_tiny, ONNX"]
     for key in ("parameters", "flops"):
         assert made[key][0] == made[key][1] > 0

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.measure import measure, measurement_of
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.types import Batch, Output
 from sweeps.plan.table import load_table
 from tests.composed import specified
@@ -112,7 +112,7 @@ def test_evaluation_counts_pixels_of_the_smaller_image(data: Path, label_resize:
         np.testing.assert_array_equal(counts.sum(0), expected)
     assert result.counts.counts.sum() == 3 * 24 * 32
     # Pictures show the label of the file; the prediction is enlarged for them.
-    assert {each.prediction.shape for each in result.kept} == {(48, 64)}
+    assert {classes.shape for _, classes in result.kept} == {(48, 64)}
 
 
 FILES = {

@@ -91,10 +91,13 @@ def noise(**changes: Any) -> list[ChosenCorruption]:
 def test_conditions_are_clean_branches_and_severities(opened: Opener) -> None:
     session = opened()
     found = [
-        each
-        for _, each in conditions(session, "test", [*noise(), choose_corruption("removed:rgb")])
+        measured
+        for _, measured in conditions(session, "test", [*noise(), choose_corruption("removed:rgb")])
     ]
-    assert [(each.file_name, each.condition, each.severity, each.view) for each in found] == [
+    assert [
+        (measured.file_name, measured.condition, measured.severity, measured.view)
+        for measured in found
+    ] == [
         ("counts_test.npz", "clean", 0.0, "rgbt"),
         ("test_thermal.npz", "thermal", 0.0, "thermal"),
         ("test_rgb.npz", "rgb", 0.0, "rgb"),
@@ -104,7 +107,7 @@ def test_conditions_are_clean_branches_and_severities(opened: Opener) -> None:
     ]
     # Changed settings are a row of their own.
     changed = [choose_corruption("occluded", ["corruption.block=16"])]
-    rows = [each.condition for _, each in conditions(session, "test", changed)]
+    rows = [measured.condition for _, measured in conditions(session, "test", changed)]
     assert set(rows[3:]) == {"occluded_block-16"}
 
 
@@ -133,7 +136,7 @@ def test_counts_are_stored_with_their_measurement_and_found_again(
     assert Counts.load(clean).measurement.is_own
     again = measure_all(opened(), "test", noise(), out)
     assert len(evaluator.calls) == 5, "nothing is made again"
-    assert [each.measurement for each in again] == [each.measurement for each in measured]
+    assert [counts.measurement for counts in again] == [counts.measurement for counts in measured]
     assert all(np.array_equal(a.counts, b.counts) for a, b in zip(again, measured, strict=True))
 
 
@@ -174,7 +177,7 @@ def test_measure_repeats_after_other_settings(
     assert {path: path.read_bytes() for path in before} == before
     assert len([*(tmp_path / "out").iterdir()]) == 10
     stored = {Counts.load(path).measurement for path in before}
-    assert not stored & {each.measurement for each in found}
+    assert not stored & {counts.measurement for counts in found}
     # What nobody names as changed would get the name of the counts that are there.
     if kind != "weights":
         with pytest.raises(InputError, match=f"holds another measurement .*{SETTINGS[kind][1]}"):
@@ -216,7 +219,7 @@ def test_counts_without_some_images_are_made_again(
         counts.select(counts.names[1:]).save(tmp_path / counts.measurement.file_name)
     found = measure_all(opened(), "test", noise(), tmp_path)
     assert evaluator.calls[5:] == EVERY[1:]
-    assert [len(each.names) for each in found] == [2, 3, 3, 3, 3]
+    assert [len(counts.names) for counts in found] == [2, 3, 3, 3, 3]
     assert found[0].names == tuple(SPLITS["test"][1:])
 
 
@@ -226,7 +229,7 @@ def test_counts_of_an_earlier_step_are_replaced(
     measure_all(opened(step=1), "test", [], tmp_path)
     found = measure_all(opened(step=2), "test", [], tmp_path)
     assert evaluator.calls == EVERY[:3] + EVERY[:3]
-    assert {each.measurement.step for each in found} == {2}
+    assert {counts.measurement.step for counts in found} == {2}
     assert Counts.load(tmp_path / "test_rgb.npz").measurement.step == 2
     assert len([*tmp_path.glob("*.npz")]) == 3
 
@@ -242,7 +245,7 @@ def test_reused_counts_are_scored_as_requested(
     found = measure_all(session, "test", noise(), tmp_path)
     assert len(evaluator.calls) == 5, "nothing is made again"
     assert {path: path.read_bytes() for path in before} == before
-    assert {(each.absent, each.unscored) for each in found} == {("exclude", ("car",))}
+    assert {(counts.absent, counts.unscored) for counts in found} == {("exclude", ("car",))}
 
 
 def test_measure_stopped_resumes(

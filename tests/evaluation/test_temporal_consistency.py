@@ -21,13 +21,14 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import NextFrames
 from rgbt.evaluation.measure import measurement_of
-from rgbt.evaluation.pair_frames import FlowRecord, Pairing, _record
-from rgbt.evaluation.temporal_consistency import (
-    Pairs,
+from rgbt.evaluation.pairs.count import (
+    CountedPairs,
     consistency_table,
     consistency_values,
     count_pairs,
 )
+from rgbt.evaluation.pairs.frames import flow_source, pairs_of
+from rgbt.evaluation.pairs.scenes import FlowRecord, flow_record
 from rgbt.metrics.pairs import ca, tc
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
@@ -37,7 +38,6 @@ from tests.commands import SPLITS, words_of
 from tests.conftest import write_png
 
 HW = (48, 64)
-VIRTUAL = Pairing("virtual")
 
 
 def one_hot(classes: Tensor) -> Output:
@@ -67,7 +67,7 @@ class Oracle(nn.Module):
 
     def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
         shown = (255 * rgb).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
-        return one_hot(torch.stack([self.answers[each.tobytes()] for each in shown]))
+        return one_hot(torch.stack([self.answers[image.tobytes()] for image in shown]))
 
 
 def on_mfnet(data: Path, *overrides: str) -> Session:
@@ -75,9 +75,10 @@ def on_mfnet(data: Path, *overrides: str) -> Session:
     return open_session(specify(compose([*words, *overrides])))
 
 
-def counted(session: Session, network: nn.Module, pairing: Pairing) -> Pairs:
+def counted(session: Session, network: nn.Module, **chosen: Any) -> CountedPairs:
     session = replace(session, model=network)
-    return count_pairs(session, measurement_of(session, "test"), pairing)
+    pairs = pairs_of(session, "test", **chosen)
+    return count_pairs(session, measurement_of(session, "test"), pairs)
 
 
 def source_of(triple: list[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +87,7 @@ def source_of(triple: list[float]) -> tuple[np.ndarray, np.ndarray]:
     Step by step as the release does it for labels: a nearest-neighbour warp onto the canvas, the
     cut, OpenCV's nearest-neighbour resize.
     """
-    yaw, pitch, roll = (radians(each) for each in triple)
+    yaw, pitch, roll = map(radians, triple)
     about_y = np.array([[cos(yaw), 0, sin(yaw)], [0, 1, 0], [-sin(yaw), 0, cos(yaw)]])
     about_x = np.array([[1, 0, 0], [0, cos(pitch), -sin(pitch)], [0, sin(pitch), cos(pitch)]])
     about_z = np.array([[cos(roll), -sin(roll), 0], [sin(roll), cos(roll), 0], [0, 0, 1]])
@@ -117,13 +118,13 @@ def by_hand(first: np.ndarray, second: np.ndarray, label: np.ndarray) -> np.ndar
 def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
     rng = np.random.default_rng(0)
     coarse = [rng.integers(0, 9, (6, 8)).astype(np.uint8) for _ in SPLITS["test"]]
-    maps = [cv2.resize(each, HW[::-1], interpolation=cv2.INTER_NEAREST) for each in coarse]
+    maps = [cv2.resize(image, HW[::-1], interpolation=cv2.INTER_NEAREST) for image in coarse]
     for name, classes in zip(SPLITS["test"], maps, strict=True):
         image = np.dstack([np.zeros((*HW, 3), np.uint8), 28 * classes])
         write_png(data / "images" / f"{name}.png", image)
         write_png(data / "labels" / f"{name}.png", classes)
     session = on_mfnet(data)
-    found = counted(session, Decoder(), VIRTUAL).counts
+    found = counted(session, Decoder()).counts
     sets = session.consistency
     for protocol in ("aligned", "released"):
         counts = found[protocol].counts.reshape(3, 3, 10, 9, 9)
@@ -146,7 +147,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
 
 def test_counts_of_neighbouring_scenes_are_kept_as_one(data: Path) -> None:
     whole, added = (
-        counted(on_mfnet(data, *words), Decoder(), VIRTUAL).counts
+        counted(on_mfnet(data, *words), Decoder()).counts
         for words in ((), ("consistency.scenes_per_count=2",))
     )
     for protocol, counts in whole.items():
@@ -156,13 +157,13 @@ def test_counts_of_neighbouring_scenes_are_kept_as_one(data: Path) -> None:
 
 
 def test_unreadable_and_repeated_names_do_not_count(data: Path) -> None:
-    whole = counted(on_mfnet(data), Decoder(), VIRTUAL).counts
+    whole = counted(on_mfnet(data), Decoder()).counts
     first, *others = SPLITS["test"]
     path = data / "images" / f"{first}.png"
     path.write_bytes(path.read_bytes()[:100])
     (data / "test.txt").write_text("\n".join([first, *others, others[0]]))
     session = on_mfnet(data, "data.on_error=skip", "scale.eval_batch_size=4")
-    for protocol, counts in counted(session, Decoder(), VIRTUAL).counts.items():
+    for protocol, counts in counted(session, Decoder()).counts.items():
         assert counts.names == tuple(others)
         # The others keep the angles of their own places in the list.
         assert np.array_equal(counts.counts, whole[protocol].counts[1:])
@@ -190,8 +191,8 @@ def followed(session: Session, name: str, values: np.ndarray) -> tuple[np.ndarra
 
 def test_the_estimated_flow_is_counted_beside_the_exact_one(tmp_path: Path) -> None:
     session = on_synth(tmp_path)
-    exact = counted(session, Decoder(), Pairing("next")).counts
-    found = counted(session, Decoder(), Pairing("next", "both"))
+    exact = counted(session, Decoder(), frames="next").counts
+    found = counted(session, Decoder(), frames="next", flow="both")
     assert set(found.counts) == {"next", "flow"}
     assert np.array_equal(found.counts["next"].counts, exact["next"].counts)
     assert re.fullmatch("flow1-[0-9a-f]{6}", found.counts["flow"].partition)
@@ -212,8 +213,8 @@ def test_reliability_of_an_estimated_flow_by_hand() -> None:
     flow = np.array([[[0, 0], [0, 3], [5, 0], [0, 9]]], np.float32)
     exact = np.array([[[0, 0], [0, 4], [np.nan, np.nan], [0, 0]]], np.float32)
     found: Any = SimpleNamespace(flow=flow, used=np.array([[True, True, True, False]]))
-    assert _record("a", found, exact) == FlowRecord("a", 0.75, 3.0, 0.5, pytest.approx(1 / 3))
-    assert _record("a", found)[:3] == ("a", 0.75, 3.0)
+    assert flow_record("a", found, exact) == FlowRecord("a", 0.75, 3.0, 0.5, pytest.approx(1 / 3))
+    assert flow_record("a", found)[:3] == ("a", 0.75, 3.0)
 
 
 def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
@@ -225,15 +226,15 @@ def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
         label[10:30, 5:40] = 255  # pixels without a label do not count
         write_png(after.dataset.root / "labels" / f"{name}.png", label)
         first, second = session.dataset.read(name), after.dataset.read(name)
-        for each in (first, second):
-            oracle.learn(each.rgb, np.where(each.label == 255, 0, each.label))
+        for frame in (first, second):
+            oracle.learn(frame.rgb, np.where(frame.label == 255, 0, frame.label))
         brought, seen = followed(session, name, first.label)
         seen &= second.label != 255
         for cls in range(9):
             one, two = (brought == cls) & seen, (second.label == cls) & seen
             agree[cls] += (one & two).sum()
             union[cls] += (one | two).sum()
-    found = counted(session, oracle, Pairing("next")).counts["next"]
+    found = counted(session, oracle, frames="next").counts["next"]
     assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
@@ -254,4 +255,25 @@ def test_second_frames_that_are_not_listed_are_refused(tmp_path: Path) -> None:
     session = on_synth(tmp_path, "scale.eval_batch_size=1")
     (session.dataset.root / "next" / "test.txt").write_text(session.dataset.names("test")[0])
     with pytest.raises(InputError):
-        counted(session, Decoder(), Pairing("next"))
+        counted(session, Decoder(), frames="next")
+
+
+@pytest.mark.parametrize(
+    ("frames", "given", "source"),
+    [
+        ("virtual", "default", None),
+        ("virtual", "exact", None),
+        ("next", "default", None),
+        ("next", "rgb", "rgb"),
+        ("video", "default", "both"),
+        ("video", "thermal", "thermal"),
+        ("virtual", "rgb", "refused"),
+        ("video", "exact", "refused"),
+    ],
+)
+def test_flow_fits_the_second_frames(frames: Any, given: str, source: str | None) -> None:
+    if source == "refused":
+        with pytest.raises(InputError, match=f"flow={given} is not possible: frames={frames}"):
+            flow_source(frames, given)
+    else:
+        assert flow_source(frames, given) == source

@@ -22,6 +22,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import available, compose
 from rgbt.evaluation import export as exporting
 from rgbt.evaluation.export import Comparison, compare, only_head, other_sizes
+from rgbt.evaluation.predict import heads_of
 from rgbt.exported.onnx_network import (
     Description,
     ExportedNetwork,
@@ -70,7 +71,7 @@ def stating(key: str, value: object) -> Callable[[Proto], None]:
     """A change of one entry of the metadata."""
 
     def change(proto: Proto) -> None:
-        entry = next(each for each in proto.metadata_props if each.key == f"rgbt.{key}")
+        (entry,) = (entry for entry in proto.metadata_props if entry.key == f"rgbt.{key}")
         entry.value = json.dumps(value(json.loads(entry.value)) if callable(value) else value)
 
     return change
@@ -101,7 +102,7 @@ def test_predictions_of_the_file_are_those_of_the_run(
 def test_metadata_of_the_file(exported: Path, trained: Trained) -> None:
     proto = onnx.load(exported)
     onnx.checker.check_model(proto)
-    found = {each.key: json.loads(each.value) for each in proto.metadata_props}
+    found = {entry.key: json.loads(entry.value) for entry in proto.metadata_props}
     assert found["rgbt.run"] == trained(*ONE).name
     assert found["rgbt.image_hw"] == [48, 64]
     assert found["rgbt.classes"][:2] == ["unlabeled", "car"]
@@ -109,7 +110,7 @@ def test_metadata_of_the_file(exported: Path, trained: Trained) -> None:
     tracking = found["rgbt.settings"]["tracking"]
     assert list(tracking) == ["_target_"], "its address may hold a password"
     assert b"stack_trace" not in exported.read_bytes(), "it names paths of this machine"
-    assert [each.version for each in proto.opset_import if not each.domain] == [18]
+    assert [opset.version for opset in proto.opset_import if not opset.domain] == [18]
 
 
 def test_view_or_head_not_in_the_graph_is_refused(changed: Changed) -> None:
@@ -128,11 +129,16 @@ def test_heads_for_day_and_night_must_be_chosen() -> None:
     dataset = SimpleNamespace(nights=lambda names: tuple("N" in name for name in names))
     session: Any = SimpleNamespace(domains=domains, dataset=dataset)
     source, target = domains.heads
-    assert only_head(session, "rgbt", "source", ("1D", "2N")) == source
-    assert only_head(session, "rgbt", "target", ("1D", "2N")) == target
-    assert only_head(session, "rgbt", "own", ("1N", "2N")) == target
+
+    def chosen(head: Any, *names: str) -> str | None:
+        predictor: Any = SimpleNamespace(heads=heads_of(session, "rgbt", head))
+        return only_head(predictor, names)
+
+    assert chosen("source", "1D", "2N") == source
+    assert chosen("target", "1D", "2N") == target
+    assert chosen("own", "1N", "2N") == target
     with pytest.raises(ValueError, match="choose it with head=source or head=target"):
-        only_head(session, "rgbt", "own", ("1D", "2N"))
+        chosen("own", "1D", "2N")
 
 
 def strange(settings: dict[str, Any]) -> dict[str, Any]:
@@ -277,8 +283,8 @@ def test_size_is_that_of_most_images(
         code, printed, err = call(EXPORT, *place, *words)
         assert code == 0, err
         assert sorted(seen) == sorted(sizes)
-        for each in said:
-            assert each in printed
+        for words_printed in said:
+            assert words_printed in printed
 
 
 @pytest.mark.slow

@@ -12,11 +12,11 @@ import torch
 from sklearn.metrics import confusion_matrix
 
 from rgbt.metrics.counting import (
-    DetailCounter,
-    RegionCounter,
     areas,
+    detail_counts,
     outlined,
     pair_counts,
+    region_counts,
 )
 from rgbt.metrics.details import Details
 from rgbt.metrics.metric import Regions
@@ -32,7 +32,8 @@ BOUNDARY, BORDER = Details("boundary", (0.02,)), Details("boundary", (0.02, 1.0)
 
 
 def counted(details: Details, *maps: object, classes: int = 2, regions: Regions = ONE) -> Any:
-    return DetailCounter(classes, regions, details)(*map(np.asarray, maps))
+    label, prediction, *values = map(np.asarray, maps)
+    return detail_counts(details, label, prediction, *(values or [None]), classes, regions)
 
 
 # Label by prediction.
@@ -41,7 +42,7 @@ def counted(details: Details, *maps: object, classes: int = 2, regions: Regions 
 def test_counts_by_hand() -> None:
     label = np.array([[0, 1], [1, 255]], np.uint8)
     prediction = np.array([[0, 0], [1, 1]], np.uint8)
-    counts = RegionCounter(2, HALVES)(label, prediction)
+    counts = region_counts(label, prediction, 2, HALVES)
     # Left: 0 seen as 0, 1 seen as 1. Right: 1 seen as 0; the ignored pixel is nowhere.
     assert counts.tolist() == [[[1, 0], [0, 1]], [[0, 0], [1, 0]]]
     assert counts.dtype == np.int64
@@ -54,7 +55,7 @@ def test_equal_to_scikit_learn_in_every_region(num_classes: int, regions: int) -
     label = rng.integers(0, num_classes + 2, shape)  # the last two are no classes
     label[rng.random(shape) < 0.1] = 255
     prediction = rng.integers(0, num_classes, shape).astype(np.uint8)
-    counts = RegionCounter(num_classes, partition)(torch.tensor(label), prediction)
+    counts = region_counts(torch.tensor(label), prediction, num_classes, partition)
     assert counts.shape == (regions, num_classes, num_classes)
     assert counts.sum() == (label < num_classes).sum()
     for region in range(0, regions, 40):
@@ -70,15 +71,15 @@ ZEROS = np.zeros((4, 4), np.uint8)
 @pytest.mark.parametrize(
     ("count", "words"),
     [
-        (lambda: RegionCounter(3, HALVES)(ZEROS, ZEROS[1:]), r"\(4, 4\), \(3, 4\)"),
-        (lambda: RegionCounter(3, HALVES)(ZEROS[None], ZEROS[None]), "maps H x W"),
-        (lambda: RegionCounter(3, HALVES)(ZEROS, ZEROS + 3), r"classes 0\.\.2, got 3"),
-        (lambda: RegionCounter(256, HALVES)(ZEROS, ZEROS), "num_classes"),
+        (lambda: region_counts(ZEROS, ZEROS[1:], 3, HALVES), r"\(4, 4\), \(3, 4\)"),
+        (lambda: region_counts(ZEROS[None], ZEROS[None], 3, HALVES), "maps H x W"),
+        (lambda: region_counts(ZEROS, ZEROS + 3, 3, HALVES), r"classes 0\.\.2, got 3"),
+        (lambda: region_counts(ZEROS, ZEROS, 256, HALVES), "num_classes"),
         (lambda: pair_counts(ZEROS + 255, ZEROS, ZEROS, 2), r"first: .* 0\.\.1, got 255"),
         (lambda: pair_counts(ZEROS, ZEROS + 1, ZEROS, 1), r"second: .* 0\.\.0, got 1"),
         (lambda: pair_counts(ZEROS, ZEROS, ZEROS, 3, np.ones(2, bool)), "one shape"),
         (lambda: counted(Details("size", (9.0,)), ZEROS, ZEROS, ZEROS[1:]), "one shape"),
-        (lambda: DetailCounter(255, ONE, BOUNDARY), "at most 254 classes"),
+        (lambda: counted(BOUNDARY, ZEROS, ZEROS, classes=255), "at most 254 classes"),
     ],
 )
 def test_what_cannot_be_counted_is_refused(count: Any, words: str) -> None:
@@ -148,11 +149,11 @@ def test_boundary_is_what_erosions_of_each_padded_mask_leave(pixels: int, border
     rng = np.random.default_rng(pixels)
     blobs = cv2.resize(rng.integers(0, 3, (6, 8)).astype(np.uint8), (40, 30), interpolation=0)
     expected = np.zeros(blobs.shape, bool)
-    for each in range(3):
-        mask = (blobs == each).astype(np.uint8)
+    for number in range(3):
+        mask = (blobs == number).astype(np.uint8)
         padded = np.pad(mask, 9) if border else np.pad(mask, 9, mode="edge")
         eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=pixels)[9:-9, 9:-9]
-        expected |= (blobs == each) & (eroded == 0)
+        expected |= (blobs == number) & (eroded == 0)
     every = np.ones(blobs.shape, bool)
     assert np.array_equal(outlined(blobs, every, pixels, border=border), expected)
 

@@ -153,7 +153,7 @@ def test_names_that_are_no_metric_are_refused(metric: str) -> None:
 
 def test_kind_of_details_that_a_metric_needs() -> None:
     kinds = {"day/class/car/ECE": "calibration", "size/0-64": "size", "class/size": None}
-    assert {each: details_of_metric(each) for each in kinds} == kinds
+    assert {metric: details_of_metric(metric) for metric in kinds} == kinds
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
     found = values(requested, many, counts, "released")
     assert found.shape == (3, 1)
-    alone = [values(requested, each[0], counts, "released") for each in many]
+    alone = [values(requested, sums[0], counts, "released") for sums in many]
     np.testing.assert_allclose(found[:, 0], alone)
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))
 
@@ -218,7 +218,7 @@ def test_requested_details() -> None:
     found = requested("[size,boundary,size]", (0.1, True), "10", "64")
     assert found == (Details("size", (64.0,)), Details("boundary", (0.1, 1.0)))
     every = requested("all", (0.1, False), "5,7.5", "64,128")
-    assert [each.setting for each in every] == [(0.1,), (15.0,), (5.0, 7.5), (64.0, 128.0)]
+    assert [details.setting for details in every] == [(0.1,), (15.0,), (5.0, 7.5), (64.0, 128.0)]
     assert every[2].bins == ("0-5", "5-7.5", "7.5-inf")
 
 

@@ -41,7 +41,7 @@ def test_equal_to_sets_of_pixels(masked: bool) -> None:
     found = [score(counts, "exclude") for score in (tc, ca, ca_released)]
     for number in range(9):
         one, two, truth = (
-            set(np.flatnonzero((each == number) & chosen)) for each in (first, second, label)
+            set(np.flatnonzero((classes == number) & chosen)) for classes in (first, second, label)
         )
         three = len(one & two & truth)
         coded = len(one) + len(two) + len(truth) - 2 * three

@@ -140,7 +140,7 @@ def test_means_by_hand(absent: Any) -> None:
     assert {f"class/{name}" for name in CLASSES} < set(summary)  # all, the unscored one too
     # A region of unscored pixels alone.
     counts = counts_of(LEFT, np.diag([0, 0, 0, 9]), RIGHT)
-    ious = [100 * each for each in (IN_LEFT[absent], 0, IN_RIGHT)]
+    ious = [100 * share for share in (IN_LEFT[absent], 0, IN_RIGHT)]
     assert value("region/2", counts, absent) == pytest.approx(
         0 if absent == "released" else NAN, nan_ok=True
     )
@@ -166,8 +166,8 @@ def test_means_over_one_labelled_class_are_undefined() -> None:
     single = replace(of_road, unscored=("car", "person", "void"))
     assert value("mIoU", single, "exclude") == pytest.approx(100 * 6 / 9)
     end = ": a mean over classes is undefined"
-    for each, where in ((of_road, "the test split"), (counts, "region 1")):
-        settings = (each.by_region(), CLASSES, each.scored, "test")
+    for found, where in ((of_road, "the test split"), (counts, "region 1")):
+        settings = (found.by_region(), CLASSES, found.scored, "test")
         assert scores.absent_notes(*settings, "exclude")[-1] == (
             f"labels of a single class in {where}{end}"
         )

@@ -16,7 +16,7 @@ from torch import Tensor
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.data.loaders import eval_batches
-from rgbt.evaluation.predictor import Predictor
+from rgbt.evaluation.predict import Predictor
 from rgbt.randomness import torch_generator
 from rgbt.runs.specify import specify
 from rgbt.types import MaskPair

@@ -21,7 +21,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.plan.measurement import Words, measurement_of
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
@@ -350,7 +350,7 @@ class Desk:
         self.executor, self.view = executor or FakeExecutor(behaviour, slots), view or FakeView()
         launcher = "submitit_slurm" if self.executor.is_lasting else "basic"
         self.settings = settings(**{"launcher": launcher, **changes})
-        self.runs = RunStore(runs_dir, NoTracking())
+        self.runs = RunStore(runs_dir, Tracking())
         self.planner: Any = planner or FakePlanner()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from analysis.archive import archived
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Point
 from sweeps.reproduce import Options, reproduce_several, settings_of
@@ -82,7 +82,7 @@ def run(
 ) -> tuple[int, list[str]]:
     """Exit code, and the experiments that were run, in their order."""
     chosen = Options(table=table, runs_dir=place / "runs", **options)
-    runs, planner = RunStore(place / "runs", NoTracking()), QuickPlanner()
+    runs, planner = RunStore(place / "runs", Tracking()), QuickPlanner()
     with driven_by(executor := FakeExecutor(behaviour), FakeView()):
         code = reproduce_several(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
     return code, [words[0].removeprefix("+experiment=") for words in executor.started()]

@@ -19,13 +19,14 @@ from rgbt.runs.folder import (
 )
 from rgbt.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking import sync
-from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_upload import (
     artifact_table,
     read_upload_state,
     write_upload_state,
 )
 from rgbt.tracking.mlflow_view import view_tags
+from rgbt.tracking.tracker import Tracking
 from tests.commands import code_of
 
 DEAD = "http://127.0.0.1:9"
@@ -56,7 +57,7 @@ def tracking(runs_dir: Path, uri: str | None = None) -> MlflowTracking:
     return MlflowTracking(uri, artifact_uri=None, experiment="rgbt", runs_dir=str(runs_dir))
 
 
-def begin(folder: RunFolder, tracker: MlflowTracking | NoTracking) -> None:
+def begin(folder: RunFolder, tracker: Tracking) -> None:
     tracker.start(folder, Description("grbm seed=0", TAGS, PARAMS))
     tracker.after_step()
 
@@ -144,7 +145,7 @@ def test_killed_run_continues_its_mlflow_run_without_duplicates(
 def test_a_run_sent_again_leaves_no_duplicate(runs_dir: Path) -> None:
     """MLflow itself drops what it has; the record of the folder is not needed for it."""
     folder = RunFolder(runs_dir / "crashed")
-    NoTracking().start(folder, Description("grbm", TAGS, PARAMS))
+    Tracking().start(folder, Description("grbm", TAGS, PARAMS))
     folder.append(5, "train", {"loss": 3.0})
     conclude(folder)
     for _ in range(3):
@@ -212,7 +213,7 @@ def test_replaced_run_and_its_successor_are_two_mlflow_runs(runs_dir: Path) -> N
         conclude(folder)
         tracker.finish("FINISHED")
     assert kept is not None
-    old, new = (run_of(runs_dir, each) for each in (kept, folder))
+    old, new = (run_of(runs_dir, path) for path in (kept, folder))
     assert (old.info.run_name, new.info.run_name) == ("grbm seed=0 (replaced)", "grbm seed=0")
     found = [(run.data.tags["rgbt.key"], run.data.tags["rgbt.group"]) for run in (old, new)]
     assert found == [("replaced/again-1", "grbm (replaced)"), ("again", "grbm")]
@@ -220,7 +221,7 @@ def test_replaced_run_and_its_successor_are_two_mlflow_runs(runs_dir: Path) -> N
 
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "deleted")
-    NoTracking().start(folder, Description("grbm", TAGS, PARAMS))
+    Tracking().start(folder, Description("grbm", TAGS, PARAMS))
     tracker = tracking(runs_dir)
     folder.append(5, "train", {"loss": 3.0})
     first = tracker.sync(folder, "RUNNING")
@@ -254,7 +255,7 @@ def test_sync_continues_behind_a_damaged_folder(
 ) -> None:
     damaged = {"a": "result.json", "b": "run.json", "c": "metrics.jsonl"}
     for key in "abcd":
-        begin(RunFolder(tmp_path / key), NoTracking())
+        begin(RunFolder(tmp_path / key), Tracking())
     for key, name in damaged.items():
         (tmp_path / key / name).write_text("{\n")
     assert read_upload_state(RunFolder(tmp_path / "d")) is None
@@ -323,7 +324,7 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
     runs_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = RunFolder(runs_dir / "key")
-    begin(folder, NoTracking())
+    begin(folder, Tracking())
     address = "http://me:Secret@127.0.0.1:9"
 
     def refuse(*_: object) -> str:

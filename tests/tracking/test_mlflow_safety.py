@@ -18,7 +18,7 @@ import pytest
 
 from rgbt.files.atomic import holding
 from rgbt.runs.folder import Description, RunFolder, counts_name
-from rgbt.tracking import mlflow_store, sync, ui
+from rgbt.tracking import mlflow_client, mlflow_store, sync, ui
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, write_upload_state
 from tests.commands import code_of
@@ -105,7 +105,7 @@ def test_nothing_is_sent_to_an_address_of_a_folder(
 def test_a_folder_of_runs_that_was_moved_keeps_its_store(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mlflow_store.set_environment()
+    mlflow_client.set_environment()
     from mlflow import MlflowClient
     from mlflow.tracking._tracking_service import utils
 
@@ -136,8 +136,8 @@ def test_a_folder_of_runs_that_was_moved_keeps_its_store(
 def test_a_server_that_never_answers_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert float(mlflow_store.ENVIRONMENT[mlflow_store.TIMEOUT]) < mlflow_store.SERVER_S < 10
-    monkeypatch.setenv(mlflow_store.TIMEOUT, "1")
+    assert float(mlflow_client.ENVIRONMENT[mlflow_client.TIMEOUT]) < mlflow_client.SERVER_S < 10
+    monkeypatch.setenv(mlflow_client.TIMEOUT, "1")
     monkeypatch.setattr(mlflow_store, "SLOW_S", 0.9)
     with socket.create_server(("127.0.0.1", 0)) as server:
         tracker = MlflowTracking(
@@ -160,7 +160,7 @@ def test_a_server_that_never_answers_is_waited_for_once(
 def test_a_slow_server_and_a_pipe_are_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(mlflow_store, "SERVER_S", 2.0)
+    monkeypatch.setattr(mlflow_client, "SERVER_S", 2.0)
     os.mkfifo(tmp_path / "mlflow.db")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -188,13 +188,13 @@ def test_a_slow_server_and_a_pipe_are_given_up(
 def test_a_held_lock_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(mlflow_store, "LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
     folder = run_folder(tmp_path / "a")
     run_folder(tmp_path / "b")
     with holding(tmp_path / ".mlflow.db.lock"):
         tracker = MlflowTracking(runs_dir=str(tmp_path))
         tracker.refresh(folder, Description("grbm", {}, {}))
-        assert "StoreBusyError: process" in capsys.readouterr().err
+        assert "TimeoutError: process" in capsys.readouterr().err
         assert tracker.links() == [("MLflow later", f"rgbt sync run={folder.path}")]
         assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
         assert capsys.readouterr().err.count("was not sent") == 1

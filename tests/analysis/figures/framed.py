@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rgbt.evaluation.pair_predictions import PairSource, write_images
+from rgbt.evaluation.pairs.frames import composed_pairs
+from rgbt.evaluation.pairs.others import write_images
 
 NAMES = ("00001N", "00000D")
 METHODS = ("a", "b")
@@ -24,8 +25,8 @@ def write_framed(folder: Path) -> None:
         pair = rng.integers(0, 256, (48, 64, 4), dtype=np.uint8)
         cv2.imwrite(str(root / "images" / f"{name}.png"), pair)
         cv2.imwrite(str(root / "labels" / f"{name}.png"), blocks(rng))
-    source = PairSource.compose(["dataset=mfnet", f"dataset.root={root}", "consistency=views"])
-    listed = write_images(source, "test", "virtual", folder / "pairs")
+    words = ["dataset=mfnet", f"dataset.root={root}", "consistency=views"]
+    listed = write_images(composed_pairs(words, "test"), folder / "pairs")
     predict(folder, listed.images, rng)
 
 

@@ -19,7 +19,7 @@ from rgbt.files.plain_files import write_json
 from rgbt.runs.naming import TAGS, VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run.optuna_study import study_folder
@@ -160,7 +160,7 @@ def test_a_preview_shows_runs_that_somebody_trains(tmp_path: Path) -> None:
 def test_a_point_is_finished_with_all_runs_and_evaluations(tmp_path: Path) -> None:
     ring, rgb = ("regions=ring9",), ("modality=rgb",)
     plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring, rgb)))
-    runs = RunStore(tmp_path, NoTracking())
+    runs = RunStore(tmp_path, Tracking())
     for run in plan.runs:
         assert evaluated_runs(plan, runs) == ()
         finish(tmp_path / run.key)

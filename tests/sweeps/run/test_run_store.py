@@ -12,14 +12,15 @@ import pytest
 from rgbt.checks import RunError
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import DATASET, finish
 
 
 @pytest.fixture
 def runs(tmp_path: Path) -> RunStore:
-    return RunStore(tmp_path, NoTracking())
+    return RunStore(tmp_path, Tracking())
 
 
 def test_find_returns_finished_runs_only(runs: RunStore) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.runs.result import RunResult
-from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.tracker import Tracking
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run import running_point
@@ -38,7 +38,7 @@ class Bench:
     """A point and its job; `steps` are those of the validations that are reported."""
 
     def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed, plan: Any = PLAN) -> None:
-        self.executor, self.runs = FakeExecutor(behaviour), RunStore(runs_dir, NoTracking())
+        self.executor, self.runs = FakeExecutor(behaviour), RunStore(runs_dir, Tracking())
         work = work_of(plan, self.runs, "")
         (job,) = self.executor.submit([work])
         self.point, self.steps = RunningPoint(plan, job, work.log, 0), list[int]()

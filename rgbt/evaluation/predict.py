@@ -25,7 +25,9 @@ DEFAULT_VIEW = "default"  # value of `modality`
 
 
 class Predictor:
-    """Predicts batches from `view` with a network in evaluation mode; each image by its head.
+    """Predicts batches from `view` with a network in evaluation mode; every image by its head.
+
+    `heads` are those of images by their names; None: the network's only one.
 
     InputError: a view or a head that the network does not have.
     """
@@ -34,12 +36,12 @@ class Predictor:
         self, session: Session, view: View | None = None, head: TestedHead | None = None
     ) -> None:
         self.view = view_of(session, view)
-        self._heads = heads_of(session, self.view, head)
-        self._session, self._settings = session, session.prediction
+        self.heads = heads_of(session, self.view, head)
+        self.session, self._settings = session, session.prediction
         self.model = session.model.eval()
 
     def counted(self, batch: Batch) -> Batch:
-        """A batch from the loader, with labels of the size at which classes are counted."""
+        """Give a batch from the loader labels of the size at which classes are counted."""
         if self._settings.counted == "label":
             return batch
         resize = mixed if self._settings.label_resize == "bilinear" else nearest
@@ -47,31 +49,31 @@ class Predictor:
         return replace(batch, label=torch.from_numpy(np.stack(labels)))
 
     def classes(self, batch: Batch) -> Tensor:
-        """(B, H', W') uint8: class of every pixel of the labels of a batch on the device."""
+        """Predict the class of every pixel of the labels of a batch: (B, H', W') uint8."""
         if self._settings.enlarged == "scores":
             return classes_of(label_scores(*self._how(batch))).to(torch.uint8)
         # Predicted at the size of the images; class numbers are enlarged like brightness.
         small = replace(batch, label=batch.label.new_zeros(len(batch.label), *_hw(batch.rgb)))
         found = classes_of(label_scores(*self._how(small))).to(torch.uint8)
-        maps = [bilinear(each, _hw(batch.label)) for each in found.cpu().numpy()]
+        maps = [bilinear(classes, _hw(batch.label)) for classes in found.cpu().numpy()]
         return torch.from_numpy(np.stack(maps)).to(found.device)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """`classes`, and the probability (B, H', W') float32 of each."""
+        """Predict `classes`, and the probability (B, H', W') float32 of each."""
         scores = label_scores(*self._how(batch))
         # The class with the highest score has the highest probability.
-        confidence = best_of(shares(scores, self.model)).score
+        confidence, _ = best_of(shares(scores, self.model))
         if self._settings.enlarged == "scores":
             return classes_of(scores).to(torch.uint8), confidence
         return self.classes(batch), confidence
 
     def probabilities(self, batch: Batch) -> Tensor:
-        """(B, K, H', W') float32: see `rgbt.engine.evaluate.shares`."""
+        """Predict `rgbt.engine.evaluate.shares` of the classes: (B, K, H', W') float32."""
         return shares(label_scores(*self._how(batch)), self.model)
 
     def _how(self, batch: Batch) -> tuple[Any, ...]:
-        heads = self._heads(batch.name)
-        return self.model, batch, self._session, self.view, heads, self._settings
+        heads = self.heads(batch.name)
+        return self.model, batch, self.session, self.view, heads, self._settings
 
 
 def _hw(images: Tensor) -> tuple[int, int]:
@@ -79,14 +81,14 @@ def _hw(images: Tensor) -> tuple[int, int]:
 
 
 def chosen(modality: str, head: str = AS_TRAINED) -> tuple[View | None, TestedHead | None]:
-    """View and head of the options of a command, None: as trained; InputError: no modality."""
+    """Return view and head of the options of a command, None: as trained; InputError: no view."""
     check_choice("modality", modality, (DEFAULT_VIEW, *VIEWS))
     view = None if modality == DEFAULT_VIEW else cast(View, modality)
     return view, None if head == AS_TRAINED else cast(TestedHead, head)
 
 
 def view_of(session: Session, view: View | None = None) -> View:
-    """The view that a network predicts from; None: that of its source domain, or its first."""
+    """Return the view that a network predicts from; None: of its source domain, or its first."""
     known = record_of(session.model).views
     if view is None:
         return session.domains.source.view or known[0]
@@ -97,7 +99,7 @@ def view_of(session: Session, view: View | None = None) -> View:
 def heads_of(
     session: Session, view: View, head: TestedHead | None = None
 ) -> Callable[[tuple[str, ...]], tuple[str | None, ...]]:
-    """Names of images -> the head that predicts each; None: the network's only one.
+    """Return a function of names of images: the head of each, None: the network's only one.
 
     InputError: `head` selects one of two, and the network has one.
     """

@@ -1,8 +1,8 @@
-"""Files of one measurement of ``rgbt consistency``: counts, flow records, picture, run values."""
+"""Write the files of ``rgbt consistency``: counts, flow records, picture, values of the run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from textwrap import shorten
@@ -12,44 +12,46 @@ import numpy as np
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.measure import check_replaceable, legend_of
-from rgbt.evaluation.pair_frames import FlowRecord
-from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
+from rgbt.evaluation.measure import check_replaceable
+from rgbt.evaluation.pairs.count import CountedPairs, consistency_values
+from rgbt.evaluation.pairs.scenes import FlowRecord
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import Protocol
 from rgbt.runs.folder import RunFolder, read_result, read_tables
 from rgbt.tables import ConsistencyTable, csv_text, without_nan
 from rgbt.tracking.pair_pictures import draw_pairs
 
 
 def write_pairs(
-    pairs: Pairs, paths: Mapping[Protocol, Path], dataset: LabelledDataset
+    pairs: CountedPairs, folder: Path, dataset: LabelledDataset
 ) -> list[tuple[str, str]]:
-    """Write counts at `paths`, flow records and picture beside them; (what, path) of each.
+    """Write counts, flow records and a picture into `folder`; return (what, path) of every file.
 
     InputError: a file holds another measurement, which is not replaced.
     """
-    new = {}
+    new, lines = {}, []
     for protocol, counts in pairs.counts.items():
-        _check_same_predictions(paths[protocol], counts)
-        if not check_replaceable(paths[protocol], counts.measurement):
-            new[paths[protocol]] = counts
+        file = folder / counts.measurement.file_name
+        _check_same_predictions(file, counts)
+        if not check_replaceable(file, counts.measurement):
+            new[file] = counts
+        lines.append((f"counts, {protocol}", str(file)))
+    folder.mkdir(parents=True, exist_ok=True)
     for file, counts in new.items():
-        file.parent.mkdir(parents=True, exist_ok=True)
         counts.save(file)
-    lines = [(f"counts, {protocol}", str(paths[protocol])) for protocol in pairs.counts]
     # Named like the counts that it shows, those of the first protocol.
-    first = paths[next(iter(pairs.counts))]
+    first = Path(lines[0][1])
     if pairs.records:
-        path = first.with_name(f"{paths['flow'].stem}.csv")
+        path = folder / Path(pairs.counts["flow"].measurement.file_name).with_suffix(".csv")
         # Unknown values are empty.
-        rows = [["" if value != value else value for value in each] for each in pairs.records]
+        rows = []
+        for record in pairs.records:
+            rows.append(["" if value != value else value for value in record])
         write_atomic(path, csv_text([FlowRecord._fields, *rows]).encode())
         lines.append(("flow of each pair", str(path)))
     if pairs.kept:  # some of its images could be read
-        picture = first.with_name(f"pairs_{first.stem}.png")
-        draw_pairs(pairs.kept, legend_of(dataset), picture)
+        picture = folder / f"pairs_{first.stem}.png"
+        draw_pairs(pairs.kept, dataset, picture)
         lines.append(("picture", str(picture)))
     return lines
 
@@ -76,18 +78,18 @@ def add_to_result(run: RunFolder, session: Session, split: str, table: Consisten
 
 
 def flow_sentences(records: Sequence[FlowRecord], least_used: float) -> Iterator[str]:
-    """What a user should know of the flow of all pairs."""
-    counted = [each for each in records if each.used >= least_used]
-    used, error, hidden = (
-        np.mean([value for each in counted if (value := getattr(each, key)) >= 0] or [np.nan])
-        for key in ("used", "end_point_error_px", "hidden")
-    )
-    length = np.median([each.displacement_px for each in counted if each.used > 0] or [np.nan])
+    """Say what a user should know of the flow of all pairs."""
+    counted = [record for record in records if record.used >= least_used]
+    used = _mean([record.used for record in counted])
+    error = _mean([record.end_point_error_px for record in counted])
+    hidden = _mean([record.hidden for record in counted])
+    lengths = [record.displacement_px for record in counted if record.used > 0]
+    length = np.median(lengths or [np.nan])
     yield (
         f"Flow of {len(counted)} pairs: {100 * used:.1f} % of the pixels are used (both directions "
         f"agree there); the median displacement is {length:.1f} pixels."
     )
-    if left_out := [each.name for each in records if each.used < least_used]:
+    if left_out := [record.name for record in records if record.used < least_used]:
         yield (
             f"{len(left_out)} pairs are left out, with less than {100 * least_used:g} % used "
             f"pixels: {shorten(', '.join(left_out), 60)}"
@@ -97,3 +99,9 @@ def flow_sentences(records: Sequence[FlowRecord], least_used: float) -> Iterator
             f"Distance from the exact flow: {error:.2f} pixels on average; {100 * hidden:.1f} % of "
             "the used pixels are hidden in the first frame."
         )
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean of the known values; NaN without any."""
+    known = [value for value in values if value >= 0]
+    return float(np.mean(known or [np.nan]))

@@ -61,7 +61,7 @@ class NetworkEntry:
 
 
 def from_overrides(name: str, overrides: Sequence[str], image_hw: Hw) -> ProfiledNetwork:
-    """The network of a configuration, at scale=paper if no scale is given.
+    """Compose a network, at scale=paper if no scale is given.
 
     Its data set need not exist. Raises InputError where Hydra or a constructor refuses an override.
     """
@@ -82,13 +82,13 @@ def from_overrides(name: str, overrides: Sequence[str], image_hw: Hw) -> Profile
 
 
 def from_models(models: str, overrides: Sequence[str], image_hw: Hw) -> list[ProfiledNetwork]:
-    """The networks "cmx_b2,mfnet", all with the same overrides; raises as `from_overrides`."""
+    """Compose the networks "cmx_b2,mfnet" with equal overrides; raises as `from_overrides`."""
     names = split_list(models, "networks")
     return [from_overrides(name, [f"model={name}", *overrides], image_hw) for name in names]
 
 
 def from_file(path: Path, overrides: Sequence[str], image_hw: Hw) -> list[ProfiledNetwork]:
-    """The networks of a YAML file: name -> `NetworkEntry`; `overrides` apply to all."""
+    """Read networks from a YAML file: name -> `NetworkEntry`; `overrides` apply to all."""
     entries = check_value(str(path), read_yaml(path), dict[str, NetworkEntry])
     return [
         from_overrides(name, [*entry.overrides, *overrides], entry.image_hw or image_hw)
@@ -99,7 +99,7 @@ def from_file(path: Path, overrides: Sequence[str], image_hw: Hw) -> list[Profil
 def from_runs(
     runs: str, runs_dir: Path, overrides: Sequence[str], image_hw: Hw, trust: Sequence[str]
 ) -> list[ProfiledNetwork]:
-    """The networks of finished runs with random weights; InputError as for other commands."""
+    """Return the networks of finished runs; InputError as for other commands."""
     networks = []
     for run in split_list(runs, "runs"):
         settings = trusted_settings(find_run(run, runs_dir), trust, overrides)
@@ -110,22 +110,24 @@ def from_runs(
 
 
 def with_onnx(networks: Sequence[ProfiledNetwork]) -> list[ProfiledNetwork]:
-    """Each network followed by its exported form, "NAME, ONNX"; InputError without the packages."""
+    """Let its exported form follow each network, "NAME, ONNX"; InputError without the packages."""
     require_packages()
-    pairs = [(each, replace(each, name=f"{each.name}, ONNX", is_onnx=True)) for each in networks]
-    return [network for pair in pairs for network in pair]
+    found = []
+    for network in networks:
+        found += [network, replace(network, name=f"{network.name}, ONNX", is_onnx=True)]
+    return found
 
 
 def check_networks(networks: Sequence[ProfiledNetwork]) -> None:
     """Raise InputError where ratios would mean nothing, or two networks have one name."""
-    names = [each.name for each in networks]
+    names = [network.name for network in networks]
     if len(set(names)) < len(names):
         raise InputError(f"networks: a name occurs twice in {', '.join(names)}.")
     for key in ("accelerator", "threads"):
-        values = {str(getattr(each.trainer, key)): each.name for each in networks}
+        values = {str(getattr(network.trainer, key)): network.name for network in networks}
         if len(values) > 1:
             raise InputError(f"trainer.{key}: networks are compared with one value, got {values}.")
-    if any(each.is_onnx for each in networks) and networks[0].trainer.accelerator != "cpu":
+    if any(network.is_onnx for network in networks) and networks[0].trainer.accelerator != "cpu":
         raise InputError("trainer.accelerator: onnx=true compares on the CPU; set it to cpu.")
 
 
@@ -145,19 +147,21 @@ class PreparedNetwork:
             model: nn.Module = network.model.build()
         on_gpu = self.device.type == "cuda"
         self._allocated = torch.cuda.memory_allocated(self.device) if on_gpu else 0
-        self.parameters = sum(each.numel() for each in model.parameters())
-        self.trainable = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        self.parameters = self.trainable = 0
+        for weights in model.parameters():
+            self.parameters += weights.numel()
+            self.trainable += weights.numel() if weights.requires_grad else 0
         # The counter of operations follows gradients otherwise, which a prediction does not have.
         self._model: nn.Module = model.eval().requires_grad_(False).to(self.device)
         self._view = network.view or record_of(model).views[0]
         self._batch = random_batch(batch_size, network.image_hw).to(self.device)
 
     def autocast(self) -> AbstractContextManager[Any]:
-        """Context of a forward pass at the precision of the network."""
+        """Return the context of a forward pass at the precision of the network."""
         return autocast(self.device, self.network.trainer.precision)
 
     def predict(self) -> Tensor:
-        """(B, H, W) uint8: the class of every pixel; waits until the device has finished.
+        """Predict the class of every pixel, (B, H, W) uint8; waits until the device has finished.
 
         Raises InputError where the network cannot predict images of this size.
         """
@@ -179,7 +183,7 @@ class PreparedNetwork:
         self._model = exported_network(self._model, self._view, image_hw, name)
 
     def peak_memory(self) -> int | None:
-        """Bytes on a CUDA device: most that weights, batch and one prediction take; else None."""
+        """Return the most bytes that weights, batch and a prediction take on CUDA; else None."""
         if self.device.type != "cuda":
             return None
         torch.cuda.reset_peak_memory_stats(self.device)
@@ -188,7 +192,7 @@ class PreparedNetwork:
 
 
 def random_batch(batch_size: int, image_hw: Hw) -> Batch:
-    """Images of random values; the speed of a prediction does not depend on them."""
+    """Draw images of random values; the speed of a prediction does not depend on them."""
     generator = torch_generator(0, "profile")
     shape = (batch_size, 4, *image_hw)
     images = torch.randint(256, shape, generator=generator, dtype=torch.uint8)

@@ -1,0 +1,1 @@
+"""Measure networks side by side: their size, operations, memory and time of a prediction."""
