@@ -16,9 +16,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-import omegaconf.base
-import omegaconf.grammar_parser
-from hydra._internal import defaults_list
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
@@ -39,6 +36,19 @@ OWN_FOLDERS = "RGBT_CONF"  # names them for every composition, with commas (conf
 SAME_FILES = {"bench": "demo"}
 
 VARIANTS = "_variants_"  # choices of a group that differ from their file in a few values
+
+# Hydra's own files, which make a quarter of the files of a composition and of its time. Left out
+# where no word names one of them: `composed` returns nothing of the node ``hydra`` but its mode.
+WITHOUT_HYDRA = (
+    "~hydra/output",
+    "~hydra/launcher",
+    "~hydra/sweeper",
+    "~hydra/help",
+    "~hydra/hydra_help",
+    "~hydra/hydra_logging",
+    "~hydra/job_logging",
+    "~hydra/env",
+)
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -126,8 +136,9 @@ def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, .
 @lru_cache(maxsize=256)
 def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
     _check_names(own)
+    chosen = words if any("hydra" in word for word in words) else (*words, *WITHOUT_HYDRA)
     with own_hydra():
-        config = hydra.compose("config", list(words), return_hydra_config=True)
+        config = hydra.compose("config", list(chosen), return_hydra_config=True)
     is_search = config.hydra.mode == RunMode.MULTIRUN
     with open_dict(config):
         del config["hydra"]
@@ -281,8 +292,6 @@ def register_resolvers() -> None:
     ``${first:${.crop_hw}}``: the first entry of a list, which may itself be resolved; null of null.
     ``${embedded:120,null}``: 120 for an embedded data set, null for images of the user.
     """
-    defaults_list._create_interpolation_map = _choices_of_children  # type: ignore[assignment]
-    omegaconf.base.parse = _parsed_text  # type: ignore[attr-defined]
     resolvers: dict[str, Callable[..., Any]] = {
         "by_scale": _by_scale,
         "by_network": _by_network,
@@ -297,16 +306,6 @@ def register_resolvers() -> None:
 
 def _is_embedded(dataset: DictConfig) -> bool:
     return str(dataset.get("_target_")).startswith("rgbt.synth.")
-
-
-def _choices_of_children(overrides: Any, children: list[Any], self_added: bool) -> DictConfig:
-    """What a file's defaults are resolved with; Hydra makes it for files without defaults, too."""
-    return _create_interpolation_map(overrides, children, self_added) if children else _NO_CHOICES
-
-
-_create_interpolation_map, _NO_CHOICES = defaults_list._create_interpolation_map, DictConfig({})
-# OmegaConf parses the text of an interpolation whenever its value is read: a fifth of its time.
-_parsed_text = lru_cache(maxsize=4096)(omegaconf.grammar_parser.parse)
 
 
 def chosen_scale(scale: str, choices: Iterable[str]) -> str:
