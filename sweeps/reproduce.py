@@ -121,8 +121,8 @@ def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings
 
     `of_hydra` are words such as hydra/launcher=ray.
     """
-    from rgbt.config.command import composing
     from rgbt.config.compose import compose_hydra
+    from rgbt.config.overrides import composing
     from sweeps.run.executors import check_launcher
     from sweeps.settings import read_launcher, read_settings
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError, check_choice, split_list
-from rgbt.config.command import composing
 from rgbt.config.component import Component
 from rgbt.config.compose import available, compose
 from rgbt.config.options import readable_paths
+from rgbt.config.overrides import composing
 from sweeps.point import Outcome
 from sweeps.run.planner import Planner
 from sweeps.run.point_list import PointList

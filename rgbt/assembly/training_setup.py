@@ -15,15 +15,9 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
-from rgbt.assembly.contracts import (
-    CheckedLoss,
-    Lists,
-    check_part,
-    check_parts,
-    first_readable,
-    is_own,
-)
+from rgbt.assembly.contracts import CheckedLoss, check_part, is_own
 from rgbt.assembly.session import Session, open_session
+from rgbt.assembly.trial import Lists, first_readable, try_parts
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.file_dataset import FileDataset
@@ -38,7 +32,14 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator
-from rgbt.requirements import Record, check_requirements, record_of
+from rgbt.requirements import (
+    NetworkRecord,
+    Record,
+    SchemeRecord,
+    TransformRecord,
+    check_requirements,
+    record_of,
+)
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
 from rgbt.types import Loadable, Sample
@@ -110,7 +111,7 @@ class TrainingSetup:
         target = session.domains.named.get("target")
         if target is None:
             return source
-        transform = record_of(session.transform).for_target or session.transform
+        transform = record_of(session.transform, TransformRecord).for_target or session.transform
         seed = derive(seed, "target domain")  # shuffled and augmented by draws of its own
         data = self.datasets["target"]
         second = train_batches(data, target.split, transform, loading, seed, steps, None)
@@ -201,9 +202,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         "data": loading,
         "dataset": session.dataset,
         "consistency": session.consistency,
-        WEIGHTS: SimpleNamespace(
-            record=Record(pretrained=spec.model.plain.get("weights") is not None)
-        ),
+        WEIGHTS: SimpleNamespace(record=Record(others={"pretrained": spec.weights is not None})),
     }
     records = check_requirements(components)
     names = session.names
@@ -212,7 +211,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = bool(missing) and labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    check_parts(session, names, masker, records)
+    try_parts(session, names, masker, records)
     absent = _absent_classes(session, names)
     if upstream_finished:
         _report_unpublished_settings(session, names)
@@ -259,7 +258,7 @@ def _shared_with_test(names: Lists, split: str) -> int:
 def _report_unpublished_settings(session: Session, names: Lists) -> None:
     """Report settings that are valid, but not those of the published numbers."""
     spec, name = session.spec, session.dataset.name
-    expected = spec.scale.pretrained and record_of(session.model).pretrained_parts
+    expected = spec.scale.pretrained and record_of(session.model, NetworkRecord).pretrained_parts
     if expected and session.weights is None:
         info(
             "the published recipe starts from ImageNet weights, but this run starts from random "
@@ -338,7 +337,7 @@ def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
 
 
 def _networks_and_optimizers(
-    session: Session, builder: Any, fabric: Fabric, record: Record
+    session: Session, builder: Any, fabric: Fabric, record: SchemeRecord
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers, by their `builder`."""
     parts, others = record.optimizers, record.networks

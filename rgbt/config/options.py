@@ -55,7 +55,7 @@ def parse(
             values[key] = _read(key, with_home(text), kinds[key])
             continue
         if heeds is None:
-            from rgbt.config.command import check_key
+            from rgbt.config.overrides import check_key
 
             check_key(word, list(kinds))
         else:

@@ -36,7 +36,7 @@ from rgbt.evaluation.tables import result_tables
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.processes import agreed, alone
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 from rgbt.runs.folder import (
     MarkerForm,
     MetricLine,
@@ -201,7 +201,10 @@ class Training:
         """Name the settings of this run with which a step needs less memory."""
         session, sizes = self.setup.session, self.setup.sizes["trained"]
         size, precision = session.loading.batch_size, session.trainer.precision
-        network, crop_hw = record_of(session.model), record_of(session.transform).crop_hw
+        network, crop_hw = (
+            record_of(session.model, NetworkRecord),
+            record_of(session.transform, TransformRecord).crop_hw,
+        )
         advice = training_advice(session.trainer, size, network, crop_hw)
         what = f"a training step of {size} images of {sizes} in {precision}"
         return naming_memory(session.device, what, advice)

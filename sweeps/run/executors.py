@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.config.command import LAUNCHERS
+from rgbt.config.overrides import LAUNCHERS
 from sweeps.run.job import Work
 from sweeps.run.local import LocalExecutor
 from sweeps.settings import GpuSlot, Launcher

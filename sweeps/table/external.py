@@ -19,10 +19,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
 from rgbt.config.options import with_home
+from rgbt.config.overrides import composing
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import read_measurement

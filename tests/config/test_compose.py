@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config import compose as composing_module
-from rgbt.config.command import composing
 from rgbt.config.compose import available, compose, conf_dir, own_hydra, searching
+from rgbt.config.overrides import composing
 
 OWN = "# @package _global_\ndefaults:\n  - sh_source\n  - _self_\nname: own_stage\n"
 

@@ -19,7 +19,7 @@ from rgbt.exported.onnx_network import exported_network
 from rgbt.files.adapters import adapter_of
 from rgbt.models.external.adapting import Untrained, replaced
 from rgbt.models.external.network import edge_map, picked, scores_at, structure
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from tests.models.external.standins import (
     HEAD,
     PAIR,
@@ -310,7 +310,7 @@ def test_training_may_read_other_scores(tmp_path: Path) -> None:
     assert evaluated.aux == {}
     torch.testing.assert_close(trained.logits, -2 * evaluated.logits)
     torch.testing.assert_close(trained.aux["aux_logits"], evaluated.logits)
-    record = record_of(net)
+    record = record_of(net, NetworkRecord)
     assert record.auxiliary
     assert [(each.node, each.key) for each in record.requires] == [("loss", "reads_auxiliary")]
 
