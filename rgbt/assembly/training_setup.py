@@ -98,8 +98,8 @@ class TrainingSetup:
         some = f" (of {MOST_HEADERS} images a split)" if is_part else ""
         return {
             "stored": f"{_in_words(set[Hw]().union(*of_split.values()))}{some}",
-            "trained": _in_words({each.thermal.shape for each in trained}),
-            "predicted": _in_words({each.thermal.shape for each in tested}),
+            "trained": _in_words({example.thermal.shape for example in trained}),
+            "predicted": _in_words({example.thermal.shape for example in tested}),
         }
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
@@ -120,7 +120,7 @@ class TrainingSetup:
 
 
 def _stored_sizes(session: Session) -> dict[str, set[Hw]]:
-    """Sizes of the images of each split; of those that are no files, of the first one."""
+    """Read sizes of the images of each split; of those that are no files, of the first one."""
     reader = reader_of(session.dataset)
     size_of = reader.stored_hw if isinstance(reader, FileDataset) else None
     found: dict[str, set[Hw]] = {}
@@ -145,7 +145,7 @@ def _black(hw: Hw) -> Sample:
 
 
 def _class_pixels(session: Session, domain: Domain) -> NDArray[np.int64]:
-    """Pixels of each class in each label of the source's split, (N, K); unlabelled images: 0."""
+    """Count pixels of each class in each label of the source's split, (N, K); unlabelled: 0."""
     if domain.labels != GIVEN:
         raise InputError(
             f"loss.class_weights: expected numbers; weights are computed from labels of the data "
@@ -173,7 +173,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     Where not `upstream_finished`, weights and pseudo-labels of upstream runs are left out.
     InputError: settings that do not fit each other, the machine or the data.
     """
-    missing = () if upstream_finished else [each.key for each in spec.dependencies]
+    missing = () if upstream_finished else [upstream.key for upstream in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
     session = replace(session, run=spec.key)
@@ -223,14 +223,24 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     others, optimizers = _networks_and_optimizers(
         session, built["optimizer"], fabric, records["scheme"]
     )
-    parts = (session, fabric, datasets, model, others, optimizers, rare, scheme)
-    return TrainingSetup(*parts, built["schedule"], absent)
+    return TrainingSetup(
+        session=session,
+        fabric=fabric,
+        datasets=datasets,
+        model=model,
+        others=others,
+        optimizers=optimizers,
+        rare=rare,
+        scheme=scheme,
+        schedule=built["schedule"],
+        absent=absent,
+    )
 
 
 def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
-    """What labels of the splits do not show; InputError: one class beside a 255 that may be one."""
+    """Say what no label of a split shows; InputError: one class beside a 255 that may be one."""
     dataset, reader = session.dataset, reader_of(session.dataset)
-    unread = {each.split for each in session.domains.named.values() if each.labels != GIVEN}
+    unread = {domain.split for domain in session.domains.named.values() if domain.labels != GIVEN}
     every = np.zeros(dataset.num_classes + 1, np.int64)
     lines: dict[str, list[str]] = {}
     for split in [split for split in names if split == "test" or split not in unread]:
@@ -251,7 +261,7 @@ def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
 
 
 def _shared_with_test(names: Lists, split: str) -> int:
-    """Number of test images in a split."""
+    """Return the number of test images in a split."""
     return len(set(names[split]) & set(names["test"]))
 
 
@@ -287,7 +297,7 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
 
 
 def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:
-    """The data set with the labels that a domain is trained with; InputError without them.
+    """Return the data set with the labels that a domain is trained with; InputError without them.
 
     Reports training images of the test split.
     """
@@ -339,12 +349,12 @@ def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
 def _networks_and_optimizers(
     session: Session, builder: Any, fabric: Fabric, record: SchemeRecord
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
-    """Further networks of a scheme, wrapped in place, and all optimisers, by their `builder`."""
+    """Wrap further networks of a scheme in place, and make all optimisers by their `builder`."""
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name in record.builders:
         _share_batch_norm(others[name], session.trainer)
         built[name] = record.builders[name](others[name])
         others[name] = fabric.setup_module(others[name])
-    wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}
+    wrapped: Any = {name: fabric.setup_optimizers(optimizer) for name, optimizer in built.items()}
     return others, wrapped

@@ -88,7 +88,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
 
 
 def _with_setting(file: str) -> str:
-    """A path after the word of the command line that names it, or a folder above it."""
+    """Return a path after the word of the command line that names it, or a folder above it."""
     found, path = "", Path(file).absolute()
     for word in sys.argv[1:]:
         value = word.partition("=")[2]

@@ -38,7 +38,6 @@ from rgbt.metrics.counts import Counts
 from rgbt.processes import agreed, alone
 from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 from rgbt.runs.folder import (
-    MarkerForm,
     MetricLine,
     RunFolder,
     counts_name,
@@ -212,7 +211,7 @@ class Training:
     def _claim(self, fingerprint: str) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         root = self.setup.session.dataset.root
-        now: MarkerForm = {"names": names_key(self.setup.session), "files": fingerprint}
+        now = {"names": names_key(self.setup.session), "files": fingerprint}
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(

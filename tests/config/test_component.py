@@ -17,7 +17,7 @@ from rgbt.config.component import Component, build, setting_types
 from rgbt.config.compose import available, conf_dir
 from rgbt.config.values import check_value
 from rgbt.ranges import Pixels, Share
-from rgbt.runs.run_spec import NODES, Values
+from rgbt.runs.run_spec import NODES, VALUES
 from tests.models.golden import alone, compose
 
 
@@ -132,11 +132,9 @@ def test_every_number_and_text_has_a_range(target: str) -> None:
         assert not unbounded(schema), f"{target}.{key}: declare a range (rgbt.ranges)"
 
 
-def test_top_level_keys_have_a_range() -> None:
-    assert not unbounded(TypeAdapter(Values).json_schema()["properties"]["seed"])
-    text = {"pretrained": None, "out": None}
-    good = {"name": "a", "seed": 0, "runs_dir": "runs", "fresh": False, **text}
-    assert check_value("", good, Values) == good
-    for wrong in (-1, 2**32, True, 0.5, None):
-        with pytest.raises(InputError, match="^'seed'"):
-            check_value("", {**good, "seed": wrong}, Values)
+@pytest.mark.parametrize("wrong", [-1, 2**32, True, 0.5, None])
+def test_top_level_keys_have_a_range(wrong: Any) -> None:
+    assert not unbounded(TypeAdapter(VALUES["seed"]).json_schema())
+    assert check_value("seed", 0, VALUES["seed"]) == 0
+    with pytest.raises(InputError, match="^'seed'"):
+        check_value("seed", wrong, VALUES["seed"])

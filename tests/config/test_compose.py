@@ -9,11 +9,12 @@ from typing import Any
 
 import hydra
 import pytest
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config import compose as composing_module
-from rgbt.config.compose import available, compose, conf_dir, own_hydra, searching
+from rgbt.config.compose import available, compose, composed, conf_dir, own_hydra, searching
 from rgbt.config.overrides import composing
 
 OWN = "# @package _global_\ndefaults:\n  - sh_source\n  - _self_\nname: own_stage\n"
@@ -151,3 +152,25 @@ def test_word_that_hydra_refuses_is_one_line(words: str, said: str) -> None:
         compose(words.split())
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+OWN_SWEEP = """# @package _global_
+defaults:
+  - sh_source
+  - override /hydra/sweeper: study
+  - _self_
+hydra: {mode: MULTIRUN, sweeper: {workers: 2}}
+"""
+
+
+def test_files_and_words_may_choose_for_hydra(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra's own files are left out of a composition where no word names them."""
+    (own / "experiment" / "own_sweep.yaml").write_text(OWN_SWEEP)
+    monkeypatch.setenv("RGBT_CONF", str(own))
+    assert not composed(["+experiment=own_stage"])[1]
+    for words in ([], ["hydra.sweeper.workers=3"], ["hydra/launcher=basic"]):
+        config, is_search = composed(["+experiment=own_sweep", *words])
+        assert is_search
+        assert config == compose(["+experiment=own_stage", "name=sh_source"])
+    with pytest.raises(MissingConfigException, match="hydra/launcher/nothing"):
+        composed(["hydra/launcher=nothing"])
