@@ -298,7 +298,7 @@ class RunFolder:
         """Mark the run as finished; everything else must be written before."""
         write_json(self.path / "result.json", result)
 
-    def mark(self, marker: MARKER) -> None:
+    def mark(self, marker: Mapping[str, str]) -> None:
         """Write ``dataset.json``, which identifies the images."""
         write_json(self.path / "dataset.json", marker)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -461,30 +461,17 @@ NODES: dict[str, Node[Any]] = {
 }
 
 
-def _keys_by_policy() -> tuple[list[str], list[str], list[str]]:
-    """Return the dotted keys outside of the key, those shared, and those of shared whole nodes."""
-    outside, shared, of_shared = ["name", "runs_dir", "out"], [], []
+def _outside_key() -> Iterator[str]:
+    yield from ("name", "runs_dir", "out")
     for name, node in NODES.items():
-        keys = [f"{name}.{key}" for key in node.outside_key]
-        outside += keys if node.in_key else [name, *keys]
-        if node.shared is True:
-            shared.append(name)
-            of_shared += keys if name != "dataset" else []
-    for name, node in NODES.items():
-        if not isinstance(node.shared, bool):
-            shared += [f"{name}.{key}" for key in node.shared]
-    return outside, ["seed", "runs_dir", "pretrained", *shared], of_shared
+        if not node.in_key:
+            yield name
+        for key in node.outside_key:
+            yield f"{name}.{key}"
 
 
-# NOT_IN_KEY: dotted keys in which two configurations of one run may differ.
-#
-# SHARED: those that an upstream run has in common with the run that needs it, beside the sizes of
-# the scale. A duration is that of the scale unless it was typed.
-NOT_IN_KEY, SHARED, _OF_SHARED = map(tuple, _keys_by_policy())
-
-# Dotted keys that a common upstream run takes over from the run that needs it first. None of them
-# enters the run key, so that it is one run for all seeds and data sets.
-SHARED_BY_COMMON = (*(key for key in SHARED if key in NOT_IN_KEY), *_OF_SHARED)
+# Dotted keys in which two configurations of one run may differ.
+NOT_IN_KEY = tuple(_outside_key())
 
 
 def is_in_key(key: str) -> bool:

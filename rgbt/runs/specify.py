@@ -3,7 +3,7 @@
 A run names an upstream run by its experiment: ``model.weights=experiment:NAME/last.pt`` starts
 from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/best.pt`` trains on
 the predictions of its network. Both runs share seed, scale and data set
-(`rgbt.runs.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
+(`SHARED`): a run of seed 2 depends on runs of seed 2.
 
 ``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own data set: all methods
 with the same network start from the same run. It also keeps its own seed, unless `seeds.start` says
@@ -37,8 +37,7 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.ranges import Seed
 from rgbt.runs.run_spec import (
     NODES,
-    SHARED,
-    SHARED_BY_COMMON,
+    NOT_IN_KEY,
     WEIGHTS,
     CheckpointFile,
     Dependency,
@@ -73,6 +72,33 @@ CHANGEABLE = (
     "trainer.precision",
     CHECKOUT,
 )
+
+
+def _shared_keys() -> Iterator[str]:
+    yield from ("seed", "runs_dir", "pretrained")
+    for name, node in NODES.items():
+        if node.shared is True:
+            yield name
+    for name, node in NODES.items():
+        if not isinstance(node.shared, bool):
+            yield from (f"{name}.{key}" for key in node.shared)
+
+
+# Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
+# the scale. A duration is that of the scale unless it was typed.
+SHARED = tuple(_shared_keys())
+
+
+def _keys_shared_by_common() -> Iterator[str]:
+    yield from (key for key in SHARED if key in NOT_IN_KEY)
+    for name, node in NODES.items():
+        if node.shared is True and name != "dataset":
+            yield from (f"{name}.{key}" for key in node.outside_key)
+
+
+# Dotted keys that a common upstream run takes over from the run that needs it first. None of them
+# enters the run key, so that it is one run for all seeds and data sets.
+SHARED_BY_COMMON = tuple(_keys_shared_by_common())
 
 
 def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:

@@ -75,7 +75,7 @@ def test_node_is_built_with_converted_values_and_offered_objects() -> None:
 
 NAN, INFINITE = float("nan"), float("inf")
 WRONG: list[tuple[dict[str, Any], str]] = [
-    *(({"size": each}, "'knob.size[1]'") for each in ([1], [1, 2.5], [1, True], [1, "2"])),
+    *(({"size": size}, "'knob.size[1]'") for size in ([1], [1, 2.5], [1, True], [1, "2"])),
     ({"kind": "c"}, "'knob.kind'"),
     ({"share": 1.5}, "'knob.share'"),
     ({"share": NAN}, "'knob.share'"),
@@ -109,7 +109,9 @@ LOW, HIGH = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
 def unbounded(schema: Any) -> list[Any]:
     """Numbers without both ends, and texts of any length, in a JSON schema."""
     if not isinstance(schema, dict):
-        return [each for part in schema for each in unbounded(part)] if type(schema) is list else []
+        return (
+            [found for part in schema for found in unbounded(part)] if type(schema) is list else []
+        )
     if {"enum", "const"} & set(schema):
         return []
     kind = schema.get("type")
@@ -119,7 +121,7 @@ def unbounded(schema: Any) -> list[Any]:
     inner = [
         unbounded(part) for key, part in schema.items() if key not in ("enum", "propertyNames")
     ]
-    return [*([schema] if is_open or is_long else []), *(each for part in inner for each in part)]
+    return [*([schema] if is_open or is_long else []), *(found for part in inner for found in part)]
 
 
 @pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.SweepSettings"])

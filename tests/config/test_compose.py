@@ -79,9 +79,9 @@ def test_a_file_holds_several_choices(own: Path, monkeypatch: pytest.MonkeyPatch
     (own / "model" / "other.yaml").write_text(f"{VARIED}  mid: null\n")
     monkeypatch.setenv("RGBT_CONF", str(own))
     names = {"my_net", "my_net_18", "my_net_big_one", "other_18", "other_big_one", "other_mid"}
-    listed = {each for each in available("model") if each.startswith(("my_net", "other"))}
+    listed = {name for name in available("model") if name.startswith(("my_net", "other"))}
     assert listed == names  # a variant without values is the name of the file's own
-    found = {each: compose([f"model={each}", "seed=7"]).model for each in sorted(names)}
+    found = {name: compose([f"model={name}", "seed=7"]).model for name in sorted(names)}
     assert found["my_net"] == found["other_mid"]
     assert "_variants_" not in found["my_net"]
     assert found["my_net"].num_classes == 9
