@@ -13,9 +13,10 @@ components require:
     scheme crm                  model.views, .stacks_passes; masker.hides_cells
     scheme temporal             loss.frames, .compares_half; masker.hides_cells;
                                 model.dense_logits; what its view requires
-    schemes of two domains      model.outputs, .features; masker.hides_cells;
+    schemes of two domains      model.outputs, .auxiliary, .features; masker.hides_cells;
                                 domains.num_domains, .separate_heads, .target_labels,
-                                .target_confidence; dataset.num_classes
+                                .target_confidence; loss.weighs_confidence;
+                                dataset.num_classes; weights that the model starts from
     domains                     scheme.num_domains, .shows_views; model.views, .heads;
                                 loss.weighs_confidence
     network                     domains.heads; loss.reads_auxiliary

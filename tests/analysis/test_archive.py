@@ -360,7 +360,7 @@ def test_changed_numbers_are_no_result(
     with monkeypatch.context() as patch:  # a stranger packs without our checks
         patch.setattr(Counts, "check", lambda _: None)
         patch.setattr(measurement, "CONTROL", re.compile("(?!)"))
-        patch.setattr(RunResult, "check", lambda _: None)
+        patch.setattr("analysis.archive.check_result", lambda _: None)
         add(run, tmp_path / "other")
     code, out, _ = call(entry, "check", f"archive={tmp_path / 'other'}")
     assert (code, "damaged" in out or kind == "settings", " same " in out) == (1, True, False)
