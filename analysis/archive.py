@@ -47,7 +47,7 @@ from rgbt.metrics.details import details_of
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.pairs import protocol_of
 from rgbt.runs.folder import RunFolder, find_run, is_finished, read_result, runs_in
-from rgbt.runs.result import RunResult
+from rgbt.runs.result import RunResult, check_result
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table, warn
 
@@ -132,7 +132,7 @@ def add(run: RunResult, folder: Path) -> Path:
     """
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
-    run.check()
+    check_result(run)
     members = _packed(run, folder / SHARED)
     path = folder / f"{run.key}.zip"
     with _undamaged(path):
@@ -379,7 +379,7 @@ def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.runs.run_spec import is_in_key
     from rgbt.runs.specify import request_again
 
-    stored.check()
+    check_result(stored)
     spec = request_again(stored.settings, stored.description.overrides)
     before, now, none = flatten(stored.settings), flatten(spec.plain), object()
     keys = sorted(filter(is_in_key, before.keys() | now.keys()))

@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from rgbt.checks import InputError
-from rgbt.config.command import built
 from rgbt.config.options import Help
+from rgbt.config.overrides import built
 from rgbt.cores import usable_cores
 from rgbt.files.atomic import check_writable, write_atomic
 from rgbt.metrics.metric import MAX_REGIONS, Absent

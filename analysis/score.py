@@ -23,9 +23,9 @@ from analysis.commands import (
     write_files,
 )
 from rgbt.checks import InputError
-from rgbt.config.command import built
 from rgbt.config.common_options import PredictionFormatOptions, RunsDir
 from rgbt.config.options import Help
+from rgbt.config.overrides import built
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent

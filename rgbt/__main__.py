@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def help_text() -> str:
-    """What ``rgbt --help`` shows: every command with one line."""
+    """Return what ``rgbt --help`` shows: every command with one line."""
     width = 2 + max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}{entry.about}" for name, entry in COMMANDS.items()]
     return HELP.format(commands="\n".join(lines))

@@ -21,18 +21,18 @@ class RunError(RuntimeError):
 
 
 def without_controls(text: str) -> str:
-    """`text` with "?" for control characters, such as codes of a terminal; new lines are kept."""
-    return "".join(each if each.isprintable() or each == "\n" else "?" for each in text)
+    """Write "?" for control characters, such as codes of a terminal; new lines are kept."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
 
 
 def one_line(text: object) -> str:
-    """`text` in one line without control characters, at most 200 characters long."""
+    """Write `text` in one line without control characters, at most 200 characters long."""
     plain = without_controls(" ".join(str(text).split())).rstrip(".")
     return plain if len(plain) <= 200 else f"{plain[:197]}..."
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """The names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm".
+    """Return the names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm".
 
     Of more than thirty names: "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 71 names".
     """
@@ -41,11 +41,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
         first, second, third = difflib.get_close_matches(word, names, n=3, cutoff=0)
         return f"did you mean '{first}', '{second}' or '{third}'? known: {len(names)} names"
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return "".join(f"did you mean '{each}'? " for each in close) + f"known: {', '.join(names)}"
+    return "".join(f"did you mean '{name}'? " for name in close) + f"known: {', '.join(names)}"
 
 
 def split_list(text: str, what: str) -> list[str]:
-    """The entries of a list as people type it: "a,b", "[a, b]", "[crm, grbm sizes=[240,480]]".
+    """Split a list as people type it: "a,b", "[a, b]", "[crm, grbm sizes=[240,480]]".
 
     InputError names `what` the entries are, where one is empty.
     """
@@ -69,14 +69,18 @@ def check_choice(name: str, value: str, known: Iterable[str]) -> None:
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
-    """Names of the tensors that hold NaN or infinity, in their order."""
+    """Return the names of the tensors that hold NaN or infinity, in their order."""
     # All sums before any is waited for: a sum is fast, and not finite if a part is not.
     sums = {name: tensor.sum().isfinite() for name, tensor in tensors.items()}
-    return [name for name, each in sums.items() if not each and not tensors[name].isfinite().all()]
+    names = []
+    for name, is_finite in sums.items():
+        if not is_finite and not tensors[name].isfinite().all():
+            names.append(name)
+    return names
 
 
 def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[str, int]:
-    """Sizes by letter: ``check_shape("label", label, "B H W", B=2)["W"]``; ValueError if other."""
+    """Return sizes by letter: ``check_shape("label", label, "B H W", B=2)["W"]``; ValueError."""
     names = letters.split()
     found = dict(zip(names, tensor.shape, strict=False))
     expected = {letter: sizes.get(letter, found.get(letter, -1)) for letter in names}
@@ -98,8 +102,8 @@ def check_members(
         if not hasattr(part, member):
             raise InputError(f"{name} has no `{member}`; see docs/how-to/add-other-components.md.")
     for method, arguments in calls.items():
-        by_keyword = {each[:-1]: None for each in arguments if each.endswith("=")}
-        by_place = [each for each in arguments if not each.endswith("=")]
+        by_keyword = {argument[:-1]: None for argument in arguments if argument.endswith("=")}
+        by_place = [argument for argument in arguments if not argument.endswith("=")]
         try:
             inspect.signature(getattr(part, method)).bind(*by_place, **by_keyword)
         except TypeError as error:
@@ -107,7 +111,7 @@ def check_members(
 
 
 def described(value: object) -> str:
-    """A value in a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "float 1.0"."""
+    """Return a value in a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "float 1.0"."""
     kind = "None" if value is None else type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{kind} {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"

@@ -37,28 +37,28 @@ class LabelledDataset(Protocol):
         """Split -> its list, or the pattern of its files."""
 
     def has(self, split: str) -> bool:
-        """Whether any image of `split` exists; InputError if the split is unknown."""
+        """Say whether any image of `split` exists; InputError if the split is unknown."""
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order; InputError if it is unknown, missing or empty."""
+        """Return the names of a split, in order; InputError if it is unknown, missing or empty."""
 
     def read(self, name: str) -> Sample:
-        """One sample; InputError if it cannot be read."""
+        """Read one sample; InputError: it cannot be read."""
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone, (H, W); None if the pair is unlabelled."""
+        """Return the label of `read` alone, (H, W); None if the pair is unlabelled."""
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens for `name`, in a fixed order, whether it exists or not."""
+        """Return the files that `read` opens for `name`, in a fixed order, existing or not."""
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files, as JSON values by key."""
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night; None if the data set does not state it."""
+        """Say whether each image was taken at night; None if the data set does not state it."""
 
     def fingerprint(self) -> str:
-        """Hash of names and files; equal copies in different folders have equal fingerprints."""
+        """Return a hash of names and files; equal copies in other folders have the same."""
 
 
 @runtime_checkable
@@ -66,7 +66,7 @@ class KnownScenes(Protocol):
     """A data set that knows depth and objects of its scenes, such as a generated one."""
 
     def scene_maps(self, name: str) -> SceneMaps:
-        """Maps of the size of the label; InputError if the image has none."""
+        """Return maps of the size of the label; InputError: the image has none."""
 
 
 class DatasetWrapper:
@@ -110,17 +110,17 @@ class Subset(DatasetWrapper):
         self._chosen = chosen
 
     def names(self, split: str) -> tuple[str, ...]:  # noqa: ARG002 - as every data set
-        """The chosen names."""
+        """Return the chosen names."""
         return self._chosen
 
 
 def background_indices(dataset: LabelledDataset) -> tuple[int, ...]:
-    """The class indices of `LabelledDataset.background`."""
+    """Return the class indices of `LabelledDataset.background`."""
     return tuple(dataset.classes.index(name) for name in dataset.background)
 
 
 def reader_of(dataset: LabelledDataset) -> LabelledDataset:
-    """The data set that reads files, behind all wrappers."""
+    """Return the data set that reads files, behind all wrappers."""
     while isinstance(dataset, DatasetWrapper):
         dataset = dataset.source
     return dataset

@@ -78,7 +78,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.corruption import corrupted, requested_corruption
     from rgbt.evaluation.predict import chosen
     from rgbt.metrics.details import requested
-    from rgbt.requirements import record_of
+    from rgbt.requirements import NetworkRecord, record_of
     from rgbt.terminal import print_rich, rich_table
     from rgbt.training.report import announce_network
 
@@ -94,7 +94,7 @@ def main(options: Options, overrides: list[str]) -> int:
     opened = open_named(options, overrides, options.regions)
     if corruption is not None:
         opened = corrupted(opened, *corruption, split)
-    views = record_of(opened.model).views if options.modality == ALL else (view,)
+    views = record_of(opened.model, NetworkRecord).views if options.modality == ALL else (view,)
     of_norm = options.batch_norm, options.batch_norm_splits
     by_view = {}
     for view in views:

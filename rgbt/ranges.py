@@ -87,7 +87,7 @@ Number = TypeVar("Number", int, float)
 
 
 def rising(ends: tuple[float, ...]) -> bool:
-    """Whether no number is smaller than the one before it."""
+    """Say whether no number is smaller than the one before it."""
     return all(a <= b for a, b in zip(ends, ends[1:], strict=False))
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.config.command import command
+from rgbt.config.overrides import words_of_run
 from rgbt.files.atomic import check_writable
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 @command(sweeper="study")
 def main(config: DictConfig, overrides: list[str]) -> int:
     """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
-    from rgbt.config.command import words_of_run
     from rgbt.runs.naming import tags_from_environment
     from rgbt.runs.specify import requested_run
     from rgbt.runtime.group import group_from_environment

@@ -47,7 +47,9 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     from rgbt.terminal import path_lines, print_rich
 
     contents, path = read(options.file), options.file
-    kinds = sorted({str(each.dtype).removeprefix("torch.") for each in contents.tensors.values()})
+    kinds = sorted(
+        {str(tensor.dtype).removeprefix("torch.") for tensor in contents.tensors.values()}
+    )
     digest = file_digest(path)
     lines = [
         ("file", f"{path} ({path.stat().st_size / 1e6:.1f} MB)"),

@@ -51,8 +51,8 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     """
     import yaml
 
-    from rgbt.config.command import composing
     from rgbt.config.compose import PIXELS
+    from rgbt.config.overrides import composing
     from rgbt.files.atomic import write_atomic
     from sweeps.plan.planner import specify_run
     from sweeps.plan.table import PUBLISHED

@@ -85,9 +85,9 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
-    from rgbt.config.command import composing
     from rgbt.config.component import Component
     from rgbt.config.compose import compose
+    from rgbt.config.overrides import composing
     from sweeps.plan.planner import Planner
     from sweeps.plan.request import check_override
     from sweeps.run.run_store import open_run_store
@@ -229,8 +229,8 @@ def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings
 
     `of_hydra` are words such as hydra/launcher=ray.
     """
-    from rgbt.config.command import composing
     from rgbt.config.compose import compose_hydra
+    from rgbt.config.overrides import composing
     from sweeps.settings import read_settings
 
     words = (*of_hydra, *readable_paths([f"runs_dir={options.runs_dir}"]), "hydra.job.name=rgbt")

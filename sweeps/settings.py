@@ -10,7 +10,7 @@ from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.command import LAUNCHERS
+from rgbt.config.overrides import LAUNCHERS
 from rgbt.config.values import check_value
 from rgbt.metrics import names as scores
 from rgbt.metrics.scores import MEANS

@@ -85,12 +85,12 @@ def test_run_wrong_setting_is_one_sentence(
     call: Call, files: Path, tmp_path: Path, text: str, word: str
 ) -> None:
     words = text.split()
-    given = {each.partition("=")[0] for each in words}
+    given = {word.partition("=")[0] for word in words}
     usual = [*(() if "+experiment" in given else ["+experiment=grbm"]), "dataset=mfnet"]
     usual += [] if "~dataset.root" in given else [f"dataset.root={files}"]
     unmasked = "masker=none" in words or words[0] in TEMPORAL
     left_out = {*given, *(["masker.patch_size"] if unmasked else [])}
-    small = [each for each in SMALL if each.partition("=")[0] not in left_out]
+    small = [word for word in SMALL if word.partition("=")[0] not in left_out]
     place = (f"runs_dir={tmp_path}", "tracking=none", *short(1))
     code, printed, err = call(main, *usual, *place, *small, *words)
     assert code == 2, err

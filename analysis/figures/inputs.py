@@ -18,9 +18,9 @@ from analysis.results import open_counts
 from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
 from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError, nearest, split_list
-from rgbt.config.command import built
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
+from rgbt.config.overrides import built
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.terminal import warn

@@ -1,4 +1,4 @@
-"""Check the components of a run, and a user's own ones against the interfaces of rgbt.
+"""Check a user's own components against the interfaces of rgbt.
 
 Classes outside this package need the members of `MEMBERS` before training starts; what they return
 is checked where a wrong value would be trained on or counted without an error. InputError names the
@@ -8,27 +8,14 @@ member or the returned value, and what was expected.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.checks import InputError, check_members, described, one_line
-from rgbt.config.stored_config import EXTERNAL
-from rgbt.dataset import reader_of
-from rgbt.maskers.masker import check_masker
-from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.requirements import Record, name_of, record_of
-from rgbt.types import IGNORE, AnyMasker, Output, Sample
-
-if TYPE_CHECKING:  # it imports this module
-    from rgbt.assembly.session import Session
-
-# Split -> names of its images.
-Lists: TypeAlias = Mapping[str, tuple[str, ...]]
+from rgbt.checks import InputError, check_members, described
+from rgbt.requirements import LossRecord, NetworkRecord, name_of, record_of
+from rgbt.types import IGNORE, Output, Sample
 
 DATASET = ("root", "name", "num_classes", "classes", "palette", "unscored", "background", "splits")
 Calls = dict[str, tuple[str, ...]]
@@ -64,7 +51,7 @@ SAMPLE = {"rgb": ("H W 3", "uint8"), "thermal": ("H W", "uint8"), "label": ("H W
 
 
 def is_own(part: object) -> bool:
-    """Whether a component is the user's own, that is, not a class of this package."""
+    """Say whether a component is the user's own, that is, not a class of this package."""
     return type(part).__module__.partition(".")[0] != "rgbt"
 
 
@@ -87,7 +74,7 @@ def check_arrays(
         if found is None and name == "label":
             continue
         letters, size = shape.split(), tuple(getattr(found, "shape", (None,)))
-        wanted = [int(each) if each.isdigit() else sizes.get(each, each) for each in letters]
+        wanted = [int(text) if text.isdigit() else sizes.get(text, text) for text in letters]
         fits = all(isinstance(a, str) or a == b for a, b in zip(wanted, size, strict=False))
         is_dtype = dtype in ("", str(getattr(found, "dtype", "")))
         if None in size or len(size) != len(letters) or not fits or not is_dtype:
@@ -158,7 +145,7 @@ def watch_model(model: nn.Module, num_classes: int) -> None:
     """
     if not is_own(model):
         return
-    record = record_of(model)
+    record = record_of(model, NetworkRecord)
     _, calls = MEMBERS["model"]
     stacked = STACKED if record.stacks_passes and record.outputs == "masks" else ()
     check_members("model", model, (), {"forward": (*calls["forward"], *stacked)})
@@ -174,8 +161,9 @@ def watch_model(model: nn.Module, num_classes: int) -> None:
         returned = f"model: {type(module).__name__}.forward returned"
         check_type(returned, found, Output)
         declared = {"aux_logits": record.auxiliary, "features": record.features}
-        for name in (name for name, is_ in declared.items() if is_ and name not in found.aux):
-            raise InputError(f"{returned} aux without `{name}`, which its record declares.")
+        for name, is_declared in declared.items():
+            if is_declared and name not in found.aux:
+                raise InputError(f"{returned} aux without `{name}`, which its record declares.")
         if found.logits is None and module.training and record.outputs == "masks":
             return  # its loss reads `aux`
         arrays = {"logits": ("B K H W", "")}
@@ -192,7 +180,7 @@ class CheckedLoss:
 
     def __init__(self, loss: Any) -> None:
         self._loss, self._is_checked = loss, False
-        self._shape = "P" if record_of(loss).frames == 1 else ""
+        self._shape = "P" if record_of(loss, LossRecord).frames == 1 else ""
         check_part("loss", loss, "loss" if self._shape else "loss of two frames")
 
     def __getattr__(self, key: str) -> Any:
@@ -207,102 +195,8 @@ class CheckedLoss:
             returned = f"loss: {name_of(self._loss)} returned"
             check_type(returned, found, dict)
             check_arrays(returned, found, dict.fromkeys(found, (self._shape, "")))
-            if not any(isinstance(each, Tensor) and each.requires_grad for each in found.values()):
+            if not any(isinstance(part, Tensor) and part.requires_grad for part in found.values()):
                 what = f"{returned} {described(found)}"
                 raise InputError(f"{what}, none of which depends on the network.")
             self._is_checked = True
         return found
-
-
-def check_parts(
-    session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
-) -> None:
-    """Use a user's own parts, an author's network, masker and cameras once."""
-    transform, seed = session.transform, session.drawn.order
-    check_dataset(reader_of(session.dataset), names)
-    check_part("transform", transform)
-    first = first_readable(session, names[session.domains.source.split])
-    shown = first_readable(session, names["test"])
-    check_regions(session.regions, shown.thermal.shape)
-    example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
-    tested = transform.test(shown)
-    if session.spec.model.target == EXTERNAL:
-        _probe_external(session, example_hw, tested.thermal.shape)
-    elif session.loading.batch_size == session.trainer.batch_norm_parts:
-        _probe_single(session, example_hw)
-    crop_hw = (not is_own(masker) and records["transform"].crop_hw) or example_hw
-    if records["masker"].hides_cells:
-        check_masker(masker, crop_hw, torch_generator(seed, "probe"))
-    cameras = [("scheme", records["scheme"].camera, example_hw)]
-    if session.consistency.sets:
-        camera = session.consistency.view.camera
-        cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
-    for node, camera, image_hw in cameras:
-        try:
-            if camera is not None:
-                camera.matrix(image_hw)
-        except InputError as error:
-            raise InputError(f"{node}.view.{error}") from error
-
-
-def first_readable(session: Session, names: tuple[str, ...]) -> Sample:
-    """The first of these samples; unreadable ones are passed over where the run does so too."""
-    for name in names if session.loading.on_error != "raise" else ():
-        with suppress(InputError):
-            return session.dataset.read(name)
-    return session.dataset.read(names[0])
-
-
-def _probe_single(session: Session, train_hw: tuple[int, int]) -> None:
-    """Refuse batches of one image where a batch normalisation gets one pixel: without variance."""
-    model, was_training = session.model, session.model.training
-    if not any(isinstance(module, _BatchNorm) for module in model.modules()):
-        return
-    before = {name: value.clone() for name, value in model.named_buffers()}
-    images = [torch.zeros(1, each, *train_hw, device=session.device) for each in (3, 1)]
-    try:
-        with torch.no_grad(), session.autocast():
-            model.train()(*images, generator=torch_generator(session.drawn.order, "probe"))
-    except ValueError as error:
-        if "more than 1 value per channel" not in str(error):
-            raise
-        raise InputError(
-            f"data.batch_size={session.loading.batch_size}: {name_of(model)} normalises one value "
-            "per channel of each batch, which has no variance; set a larger batch."
-        ) from error
-    for name, value in model.named_buffers():
-        value.copy_(before[name])
-    model.train(was_training)
-
-
-def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
-    """Call another author's network once per size of image, so that it is refused before a run.
-
-    In training too, as its output may have another form there; its statistics do not change.
-    """
-    from rgbt.models.external.network import author_line  # most networks are of this package
-
-    model = session.model
-    before = {name: value.clone() for name, value in model.named_buffers()}
-    for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
-        model.train(is_training)
-        count = min(2, session.loading.batch_size) if is_training else 1
-        images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
-        try:
-            with torch.set_grad_enabled(is_training), session.autocast():
-                output = model(*images, generator=torch_generator(session.drawn.order, "probe"))
-        except (InputError, torch.OutOfMemoryError):
-            raise
-        except Exception as error:
-            size = " x ".join(map(str, image_hw))
-            said = f"{type(error).__name__}: {one_line(error)}{author_line(error)}"
-            raise InputError(
-                f"model: the network cannot predict {count} images of {size} pixels ({said})."
-            ) from error
-    for name, value in model.named_buffers():
-        value.copy_(before[name])
-    if not output.logits.requires_grad:
-        raise InputError(
-            f"model.constructor={session.spec.model.values['constructor']}: the class scores have "
-            "no gradient in training; choose others with model.train_scores."
-        )

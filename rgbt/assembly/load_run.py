@@ -46,7 +46,7 @@ CHECKPOINTS = ("best", "last")
 def trusted_settings(
     folder: Path, trust: Collection[str] = (), overrides: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """The configuration of a run, whose objects may be built; InputError if not trusted.
+    """Return the configuration of a run, whose objects may be built; InputError if not trusted.
 
     A checkout that `overrides` name instead of the stored one is trusted.
     """
@@ -67,7 +67,7 @@ def open_named(
     regions: str = AS_TRAINED,
     label_map: LabelMap | None = None,
 ) -> Session:
-    """The network that the options of a command name; `regions`: a file of ``conf/metric``."""
+    """Open the network that options of a command name; `regions`: a file of ``conf/metric``."""
     if options.run and options.exported is not None:
         raise InputError("exported: it has its own weights; omit run=.")
     source = options.exported or options.run
@@ -84,7 +84,7 @@ def open_network(
     label_map: LabelMap | None = None,
     trust: Collection[str] = (),
 ) -> Session:
-    """A trained network: of a run, of a file of `rgbt export`, or of a file of weights.
+    """Open a trained network: of a run, of a file of `rgbt export`, or of a file of weights.
 
     Evaluations of files are written below `runs_dir` by default.
 
@@ -145,7 +145,7 @@ def open_run(
     label_map: LabelMap | None = None,
     trust: Collection[str] = (),
 ) -> Session:
-    """The network of the run in a folder with its weights; other arguments as of `open_network`.
+    """Open the network of the run in a folder; other arguments as of `open_network`.
 
     Raises:
         InputError: a target not trusted, overrides that do not fit, no checkpoint, other classes.
@@ -174,7 +174,7 @@ def with_weights(
     trained_with: Mapping[str, Any],
     label_map: LabelMap | None = None,
 ) -> Session:
-    """The network of `spec` with the weights of a checkpoint in its folder, "best" or "last".
+    """Open the network of `spec` with a checkpoint of its folder, "best" or "last".
 
     `trained_with` are the plain settings of the run, which the checkpoint has to belong to.
     """
@@ -215,7 +215,7 @@ def _changed(
 
 
 def _typed(session: Session, overrides: Sequence[str]) -> tuple[str, ...]:
-    """The settings of a network that is no run which were typed; see `Session.changed`."""
+    """Return the settings of a network that is no run which were typed; see `Session.changed`."""
     every = (word.lstrip("+").partition("=")[0] for word in overrides)
     words = [word for word in every if word != "dataset"]  # its images say what it is
     read = reader_settings(session.dataset)
@@ -226,7 +226,7 @@ def _typed(session: Session, overrides: Sequence[str]) -> tuple[str, ...]:
 
 
 def _digest(path: Path, session: Session) -> str:
-    """SHA-256 in hexadecimal of a file of weights and of the settings of the network."""
+    """Return the SHA-256 in hexadecimal of a file of weights and of the settings of the network."""
     model = {key: value for key, value in session.spec.model.plain.items() if key != "weights"}
     digest = hashlib.sha256(json.dumps(model, sort_keys=True).encode())
     with path.open("rb") as file:

@@ -82,7 +82,7 @@ class Session:
     dataset_words: tuple[str, ...] = ()
 
     def autocast(self) -> AbstractContextManager[Any]:
-        """Context of a forward pass at the precision of the run."""
+        """Return the context of a forward pass at the precision of the run."""
         return autocast(self.device, self.trainer.precision)
 
     @cached_property
@@ -169,7 +169,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
     A second line warns if the network has other inputs or settings than the weights were trained
     with, as far as the file or its layout tells. InputError: the file does not fit.
     """
-    source, fresh = spec.weights_path, spec.fresh_parts
+    source, fresh = spec.weights_path, tuple(spec.model.plain.get("fresh") or ())
     if source is None:
         if fresh:
             raise InputError("model.fresh has no effect without model.weights.")
@@ -197,7 +197,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
 
 
 def differences(node: Mapping[str, Any], convention: Iterable[str]) -> list[str]:
-    """Which overrides, such as "model/inputs=unit", would change the network of a `node`."""
+    """Return which overrides, such as "model/inputs=unit", would change the network of a `node`."""
     return [override for override in convention if not _holds(node, override)]
 
 
@@ -214,7 +214,7 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
 
 
 def measured_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a plain configuration that decide how images are predicted, by dotted key."""
+    """Return the settings that decide how images are predicted, by dotted key."""
     nodes = {key: plain[key] for key in ("transform", "prediction")}
     nodes["trainer"] = {"precision": plain["trainer"]["precision"]}
     nodes["data"] = {"eval_batch_size": plain["data"]["eval_batch_size"]}
@@ -222,7 +222,7 @@ def measured_settings(plain: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def reader_settings(dataset: LabelledDataset) -> dict[str, Any]:
-    """The settings of a data set that change the pixels of its files, by dotted key."""
+    """Return the settings of a data set that change the pixels of its files, by dotted key."""
     found = {f"dataset.{key}": value for key, value in dataset.decoding().items()}
     found.pop("dataset.layouts", None)  # which files these are, says the fingerprint
     if "dataset.codes" in found:  # numbers in label files, a setting of this name
@@ -231,7 +231,7 @@ def reader_settings(dataset: LabelledDataset) -> dict[str, Any]:
 
 
 def names_key(session: Session) -> str:
-    """SHA-256 over the names of the training splits and of the test split."""
+    """Return the SHA-256 over the names of the training splits and of the test split."""
     domains = (domain.split for domain in session.domains.named.values())
     lists = {split: session.names[split] for split in (*domains, "test")}
     return hashlib.sha256(json.dumps(lists).encode()).hexdigest()

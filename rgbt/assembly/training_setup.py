@@ -15,15 +15,9 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
-from rgbt.assembly.contracts import (
-    CheckedLoss,
-    Lists,
-    check_part,
-    check_parts,
-    first_readable,
-    is_own,
-)
+from rgbt.assembly.contracts import CheckedLoss, check_part, is_own
 from rgbt.assembly.session import Session, open_session
+from rgbt.assembly.trial import Lists, first_readable, try_parts
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.file_dataset import FileDataset
@@ -38,7 +32,14 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator
-from rgbt.requirements import Record, check_requirements, record_of
+from rgbt.requirements import (
+    NetworkRecord,
+    Record,
+    SchemeRecord,
+    TransformRecord,
+    check_requirements,
+    record_of,
+)
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
 from rgbt.types import Loadable, Sample
@@ -97,8 +98,8 @@ class TrainingSetup:
         some = f" (of {MOST_HEADERS} images a split)" if is_part else ""
         return {
             "stored": f"{_in_words(set[Hw]().union(*of_split.values()))}{some}",
-            "trained": _in_words({each.thermal.shape for each in trained}),
-            "predicted": _in_words({each.thermal.shape for each in tested}),
+            "trained": _in_words({example.thermal.shape for example in trained}),
+            "predicted": _in_words({example.thermal.shape for example in tested}),
         }
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
@@ -110,7 +111,7 @@ class TrainingSetup:
         target = session.domains.named.get("target")
         if target is None:
             return source
-        transform = record_of(session.transform).for_target or session.transform
+        transform = record_of(session.transform, TransformRecord).for_target or session.transform
         seed = derive(seed, "target domain")  # shuffled and augmented by draws of its own
         data = self.datasets["target"]
         second = train_batches(data, target.split, transform, loading, seed, steps, None)
@@ -119,7 +120,7 @@ class TrainingSetup:
 
 
 def _stored_sizes(session: Session) -> dict[str, set[Hw]]:
-    """Sizes of the images of each split; of those that are no files, of the first one."""
+    """Read sizes of the images of each split; of those that are no files, of the first one."""
     reader = reader_of(session.dataset)
     size_of = reader.stored_hw if isinstance(reader, FileDataset) else None
     found: dict[str, set[Hw]] = {}
@@ -144,7 +145,7 @@ def _black(hw: Hw) -> Sample:
 
 
 def _class_pixels(session: Session, domain: Domain) -> NDArray[np.int64]:
-    """Pixels of each class in each label of the source's split, (N, K); unlabelled images: 0."""
+    """Count pixels of each class in each label of the source's split, (N, K); unlabelled: 0."""
     if domain.labels != GIVEN:
         raise InputError(
             f"loss.class_weights: expected numbers; weights are computed from labels of the data "
@@ -172,7 +173,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     Where not `upstream_finished`, weights and pseudo-labels of upstream runs are left out.
     InputError: settings that do not fit each other, the machine or the data.
     """
-    missing = () if upstream_finished else [each.key for each in spec.dependencies]
+    missing = () if upstream_finished else [upstream.key for upstream in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
     session = replace(session, run=spec.key)
@@ -201,9 +202,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         "data": loading,
         "dataset": session.dataset,
         "consistency": session.consistency,
-        WEIGHTS: SimpleNamespace(
-            record=Record(pretrained=spec.model.plain.get("weights") is not None)
-        ),
+        WEIGHTS: SimpleNamespace(record=Record(others={"pretrained": spec.weights is not None})),
     }
     records = check_requirements(components)
     names = session.names
@@ -212,7 +211,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = bool(missing) and labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    check_parts(session, names, masker, records)
+    try_parts(session, names, masker, records)
     absent = _absent_classes(session, names)
     if upstream_finished:
         _report_unpublished_settings(session, names)
@@ -224,14 +223,24 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     others, optimizers = _networks_and_optimizers(
         session, built["optimizer"], fabric, records["scheme"]
     )
-    parts = (session, fabric, datasets, model, others, optimizers, rare, scheme)
-    return TrainingSetup(*parts, built["schedule"], absent)
+    return TrainingSetup(
+        session=session,
+        fabric=fabric,
+        datasets=datasets,
+        model=model,
+        others=others,
+        optimizers=optimizers,
+        rare=rare,
+        scheme=scheme,
+        schedule=built["schedule"],
+        absent=absent,
+    )
 
 
 def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
-    """What labels of the splits do not show; InputError: one class beside a 255 that may be one."""
+    """Say what no label of a split shows; InputError: one class beside a 255 that may be one."""
     dataset, reader = session.dataset, reader_of(session.dataset)
-    unread = {each.split for each in session.domains.named.values() if each.labels != GIVEN}
+    unread = {domain.split for domain in session.domains.named.values() if domain.labels != GIVEN}
     every = np.zeros(dataset.num_classes + 1, np.int64)
     lines: dict[str, list[str]] = {}
     for split in [split for split in names if split == "test" or split not in unread]:
@@ -252,14 +261,14 @@ def _absent_classes(session: Session, names: Lists) -> tuple[str, ...]:
 
 
 def _shared_with_test(names: Lists, split: str) -> int:
-    """Number of test images in a split."""
+    """Return the number of test images in a split."""
     return len(set(names[split]) & set(names["test"]))
 
 
 def _report_unpublished_settings(session: Session, names: Lists) -> None:
     """Report settings that are valid, but not those of the published numbers."""
     spec, name = session.spec, session.dataset.name
-    expected = spec.scale.pretrained and record_of(session.model).pretrained_parts
+    expected = spec.scale.pretrained and record_of(session.model, NetworkRecord).pretrained_parts
     if expected and session.weights is None:
         info(
             "the published recipe starts from ImageNet weights, but this run starts from random "
@@ -288,7 +297,7 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
 
 
 def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:
-    """The data set with the labels that a domain is trained with; InputError without them.
+    """Return the data set with the labels that a domain is trained with; InputError without them.
 
     Reports training images of the test split.
     """
@@ -338,14 +347,14 @@ def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
 
 
 def _networks_and_optimizers(
-    session: Session, builder: Any, fabric: Fabric, record: Record
+    session: Session, builder: Any, fabric: Fabric, record: SchemeRecord
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
-    """Further networks of a scheme, wrapped in place, and all optimisers, by their `builder`."""
+    """Wrap further networks of a scheme in place, and make all optimisers by their `builder`."""
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name in record.builders:
         _share_batch_norm(others[name], session.trainer)
         built[name] = record.builders[name](others[name])
         others[name] = fabric.setup_module(others[name])
-    wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}
+    wrapped: Any = {name: fabric.setup_optimizers(optimizer) for name, optimizer in built.items()}
     return others, wrapped

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rgbt.checkpoints.files import Contents, in_words, read
 from rgbt.checkpoints.kinds import KINDS, NONE, OWN, Kind, family_of
 from rgbt.checks import InputError, not_finite, one_line
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 
 # Last word of batch normalisation's counters, which files of old torch versions lack.
 COUNTER = "num_batches_tracked"
@@ -138,7 +138,7 @@ def plan_for(
             raise InputError(f"model.fresh: no name in state_dict() begins with '{part}.'")
     kind = _kind_of(model, contents)
     # This holds for a file of a backbone alone: a file of the whole network holds what was drawn.
-    drawn = tuple(record_of(model).drawn_anew) if kind.fresh != NONE else ()
+    drawn = tuple(record_of(model, NetworkRecord).drawn_anew) if kind.fresh != NONE else ()
     tensors = dict(contents.tensors)
     sources = {entry: kind.prefix + kind.source(entry) for entry in state}
     found: dict[str, list[str]] = defaultdict(list)
@@ -190,7 +190,7 @@ def _kind_of(model: nn.Module, contents: Contents) -> Kind:
             return kind
     if contents.tensors.keys() == state.keys():
         return Kind("state_dict() of such a network")
-    if names := record_of(model).author_names:
+    if names := record_of(model, NetworkRecord).author_names:
         beginning, prefix = names
         return Kind(
             "of its author", prefix=prefix, source=lambda each: each.removeprefix(beginning)

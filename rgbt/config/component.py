@@ -79,7 +79,10 @@ class Component:
             if key in run_settings:
                 check_value(name, value, run_settings[key])
             elif key not in parameters:
-                known = [*run_settings, *(each for each in parameters if each in kinds)]
+                known = [
+                    *run_settings,
+                    *(parameter for parameter in parameters if parameter in kinds),
+                ]
                 hint = nearest(str(key), known)
                 raise InputError(f"'{name}' is not a setting of {node['_target_']}; {hint}.")
             elif isinstance(value, Mapping) and "_target_" in value:
@@ -89,7 +92,7 @@ class Component:
         return cls(path, node["_target_"], values, dict(node))
 
     def build(self, **collaborators: Any) -> Any:
-        """The object, with those `collaborators` (a network for a scheme) that it takes.
+        """Return the object, with those `collaborators` (a network for a scheme) that it takes.
 
         Components inside get those that they take, too.
         """
@@ -115,7 +118,7 @@ _checked: dict[tuple[str, str], Component] = {}
 def checked_nodes(
     plain: Mapping[str, Any], names: Iterable[str], built: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Nodes of a configuration by name, checked; those in `built` as their objects.
+    """Check nodes of a configuration, and return them by name; those in `built` as their objects.
 
     A node is checked once per process, unless it names a user's class, which may have changed.
     """
@@ -130,7 +133,7 @@ def checked_nodes(
 
 
 def objects(parts: Mapping[str, Any], collaborators: Mapping[str, Any]) -> dict[str, Any]:
-    """The objects of components by name, and all other values as they are."""
+    """Return the objects of components by name, and all other values as they are."""
     return {
         name: part.build(**collaborators) if isinstance(part, Component) else part
         for name, part in parts.items()
@@ -138,12 +141,12 @@ def objects(parts: Mapping[str, Any], collaborators: Mapping[str, Any]) -> dict[
 
 
 def build(node: Any, **collaborators: Any) -> Any:
-    """The object of a node, checked and built at once (see `Component`)."""
+    """Return the object of a node, checked and built at once (see `Component`)."""
     return Component.from_node(node).build(**collaborators)
 
 
 def constructor(target: Any, path: str) -> Any:
-    """The class or function that `target` names; its module is imported.
+    """Return the class or function that `target` names; its module is imported.
 
     InputError where there is none, or Hydra's policy refuses it (os.system).
     """
@@ -151,7 +154,7 @@ def constructor(target: Any, path: str) -> Any:
 
 
 def _authorized(target: Any, path: str) -> functools.partial[Any]:
-    """`target` as Hydra's `instantiate` returns it, which refuses what executes code."""
+    """Return `target` from Hydra's `instantiate`, which refuses what executes code."""
     target = check_value(f"{path}._target_", target, Text)
     try:
         if _partial(target).func is not get_object(target):  # its module was imported anew
@@ -165,7 +168,7 @@ def _authorized(target: Any, path: str) -> functools.partial[Any]:
 
 @functools.cache
 def _partial(target: str) -> functools.partial[Any]:
-    """Cached, because Hydra needs 2 ms and a configuration has 40 targets."""
+    """Keep a target: Hydra needs 2 ms, and a configuration has 40 targets."""
     if target.startswith("rgbt."):  # Hydra would look for an attribute of each package first
         with suppress(ImportError):
             importlib.import_module(target.rpartition(".")[0])
@@ -175,7 +178,7 @@ def _partial(target: str) -> functools.partial[Any]:
 
 @functools.cache
 def setting_types(target: Any) -> dict[str, Any]:
-    """Types of a constructor's settings with their ranges, by key.
+    """Return the types of a constructor's settings with their ranges, by key.
 
     A name that its module imports for a type checker only, as Optuna's do, is any type.
     """
@@ -188,4 +191,4 @@ def setting_types(target: Any) -> dict[str, Any]:
             name = str(error.name)
             absent[name] = getattr(collections.abc, name, Any)
         else:
-            return {key: each for key, each in hints.items() if key != "return"}
+            return {key: kind for key, kind in hints.items() if key != "return"}

@@ -1,7 +1,9 @@
 """Compose the configuration with Hydra, list its files, and register its resolvers.
 
-Each file is parsed once while a command runs (`hydra_plugins.rgbt_conf`), and each choice of files
-is composed once. Tables and searches set values on copies of it, which is thirty times faster.
+Nothing of Hydra or OmegaConf is replaced: files are read by a plugin of the kind that Hydra offers
+for sources of configurations (`hydra_plugins.rgbt_conf`), which parses each file once while a
+command runs and knows several choices in one file. Each choice of files is composed once. Tables
+and searches set values on copies of it, which is thirty times faster.
 """
 
 from __future__ import annotations
@@ -16,9 +18,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-import omegaconf.base
-import omegaconf.grammar_parser
-from hydra._internal import defaults_list
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
@@ -40,11 +39,24 @@ SAME_FILES = {"bench": "demo"}
 
 VARIANTS = "_variants_"  # choices of a group that differ from their file in a few values
 
+# Hydra's own files, which make a quarter of the files of a composition and of its time. Left out
+# where no word names one of them: `composed` returns nothing of the node ``hydra`` but its mode.
+WITHOUT_HYDRA = (
+    "~hydra/output",
+    "~hydra/launcher",
+    "~hydra/sweeper",
+    "~hydra/help",
+    "~hydra/hydra_help",
+    "~hydra/hydra_logging",
+    "~hydra/job_logging",
+    "~hydra/env",
+)
+
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
 
 def conf_dir() -> Path:
-    """The folder of configuration files: inside an installed wheel, or beside the package."""
+    """Find the folder of configuration files: inside an installed wheel, or beside the package."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
@@ -63,35 +75,35 @@ def searching(words: Sequence[str]) -> Iterator[None]:
 
 
 def own_folders() -> str:
-    """Folders of the user's own files, as they were typed; "": none."""
+    """Return the folders of the user's own files, as they were typed; "": none."""
     return os.environ.get(OWN_FOLDERS, "")
 
 
 def own_paths() -> list[str]:
-    """The same folders one by one."""
-    typed = (each.strip().strip("'\"") for each in own_folders().split(","))
-    return [each for each in typed if each]
+    """Return the same folders one by one."""
+    typed = (folder.strip().strip("'\"") for folder in own_folders().split(","))
+    return [folder for folder in typed if folder]
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The unchecked configuration of `rgbt.run`; HydraException or OmegaConfBaseException."""
+    """Compose `rgbt.run`'s configuration, unchecked; HydraException, OmegaConfBaseException."""
     return composed(overrides)[0]
 
 
 def composed(overrides: Sequence[str]) -> tuple[DictConfig, bool]:
-    """The same, and whether its files make it a search (``hydra.mode=MULTIRUN``)."""
+    """Return the same, and whether its files make it a search (``hydra.mode=MULTIRUN``)."""
     files, values = _divided(tuple(overrides))
     try:
         config, is_search = pickle.loads(_by_hydra(files, own_folders()))  # noqa: S301 - made below
-        for each in values:  # as Hydra does after it has merged the files
-            OmegaConf.update(config, each.key_or_group, each.value())
+        for override in values:  # as Hydra does after it has merged the files
+            OmegaConf.update(config, override.key_or_group, override.value())
     except (HydraException, OmegaConfBaseException):  # Hydra names the first wrong word of all
         config, is_search = pickle.loads(_by_hydra(tuple(overrides), own_folders()))  # noqa: S301
     return config, is_search
 
 
 def compose_hydra(words: Sequence[str]) -> DictConfig:
-    """The node ``hydra`` of the configuration, with its own words (``hydra/launcher=ray``)."""
+    """Compose the node ``hydra`` of the configuration, by words such as ``hydra/launcher=ray``."""
     with own_hydra():
         config = hydra.compose("config", list(words), return_hydra_config=True)
     OmegaConf.set_readonly(config.hydra, False)
@@ -100,7 +112,7 @@ def compose_hydra(words: Sequence[str]) -> DictConfig:
 
 @lru_cache(maxsize=4096)
 def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, ...]]:
-    """The words that choose files, and the overrides that set values afterwards.
+    """Return the words that choose files, and the overrides that set values afterwards.
 
     The order of other words matters (keys that are added or removed, whole nodes): Hydra takes all.
     """
@@ -109,15 +121,15 @@ def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, .
     except HydraException:
         return words, ()
     files, values = [], []
-    for word, each in zip(words, parsed, strict=True):
-        key = each.key_or_group
-        is_value = each.package is None and ("." in key or key in top_level()[1])
-        if each.is_sweep_override() or isinstance(each.value(), dict):
+    for word, override in zip(words, parsed, strict=True):
+        key = override.key_or_group
+        is_value = override.package is None and ("." in key or key in top_level()[1])
+        if override.is_sweep_override() or isinstance(override.value(), dict):
             return words, ()
         if not is_value or key.startswith("hydra."):
             files.append(word)
-        elif each.type == OverrideType.CHANGE:
-            values.append(each)
+        elif override.type == OverrideType.CHANGE:
+            values.append(override)
         else:
             return words, ()
     return tuple(files), tuple(values)
@@ -126,8 +138,9 @@ def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, .
 @lru_cache(maxsize=256)
 def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
     _check_names(own)
+    chosen = words if any("hydra" in word for word in words) else (*words, *WITHOUT_HYDRA)
     with own_hydra():
-        config = hydra.compose("config", list(words), return_hydra_config=True)
+        config = hydra.compose("config", list(chosen), return_hydra_config=True)
     is_search = config.hydra.mode == RunMode.MULTIRUN
     with open_dict(config):
         del config["hydra"]
@@ -136,8 +149,8 @@ def _by_hydra(words: tuple[str, ...], own: str) -> bytes:
 
 @cache
 def _check_names(_own: str) -> None:
-    """InputError: a file of the user is never read, because rgbt has one of its name."""
-    for folder in (each.removeprefix("file://") for each in own_paths()):
+    """Refuse a file of the user that is never read, because rgbt has one of its name."""
+    for folder in (path.removeprefix("file://") for path in own_paths()):
         if Path(folder).resolve() == conf_dir().resolve():
             continue
         for file in sorted(Path(folder).rglob("*.yaml")):
@@ -147,7 +160,7 @@ def _check_names(_own: str) -> None:
 
 
 def variants_of(file: Path) -> dict[str, dict[str, Any] | None]:
-    """The values of every variant of a file, by the end of its name; {} where it has none.
+    """Return the values of every variant of a file, by the end of its name; {} where it has none.
 
     A file may hold several choices of its group: ``_variants_: {b0: {...}}`` in cmx.yaml is the
     choice cmx_b0, whose values replace those of the file. Null is the file itself: ``{b2: null}``
@@ -166,14 +179,14 @@ def _variants(file: str, _changed: int) -> dict[str, dict[str, Any] | None]:
 
 
 def choices_in(group: Path) -> set[str]:
-    """Names of the choices in the folder of a group."""
+    """Return the names of the choices in the folder of a group."""
     files = [file for file in group.glob("*.yaml") if file.is_file()]
-    varied = {f"{file.stem}_{each}" for file in files for each in variants_of(file)}
+    varied = {f"{file.stem}_{variant}" for file in files for variant in variants_of(file)}
     return varied | {file.stem for file in files if None not in variants_of(file).values()}
 
 
 def place_of(folder: str, name: str) -> tuple[Path, str | None] | None:
-    """The file of a choice such as "model/cmx_b0", and its variant; None: no such choice."""
+    """Return the file of a choice such as "model/cmx_b0", and its variant; None: no such choice."""
     path = Path(folder, name.removesuffix(".yaml"))
     file = path.with_name(f"{path.name}.yaml")
     if file.is_file():
@@ -188,7 +201,7 @@ def place_of(folder: str, name: str) -> tuple[Path, str | None] | None:
 
 
 def parsed(folder: str, provider: str, name: str) -> ConfigResult:
-    """A copy of a parsed file, for Hydra, which changes it: parsing takes half of its time."""
+    """Copy a parsed file for Hydra, which changes it: parsing takes half of its time."""
     result: ConfigResult = pickle.loads(_parsed(folder, provider, name))  # noqa: S301 - made below
     return result
 
@@ -207,24 +220,24 @@ def _parsed(folder: str, provider: str, name: str) -> bytes:
 
 
 def load_choice(name: str) -> dict[str, Any]:
-    """The values of a choice of ``conf/`` with its defaults, not resolved: "model/cmx_b0"."""
+    """Read a choice of ``conf/`` such as "model/cmx_b0" with its defaults, not resolved."""
     result = parsed(str(conf_dir()), "conf", name)
     return cast("dict[str, Any]", OmegaConf.to_container(result.config))
 
 
 def available(group: str) -> list[str]:
-    """Names of the files of a group such as "experiment" or "model/inputs", also of the user's."""
+    """List the choices of a group such as "experiment" or "model/inputs", also the user's."""
     return list(_listed(group, ObjectType.CONFIG, own_folders()))
 
 
 def groups() -> list[str]:
-    """Names of the groups, also of the user's."""
+    """Return the names of the groups, also of the user's."""
     return list(_listed("", ObjectType.GROUP, own_folders()))
 
 
 @cache
 def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
-    """Cached, because Hydra needs 20 ms. The search path has `_own` from the environment."""
+    """Keep a list: Hydra needs 20 ms. The search path has `_own` from the environment."""
     with own_hydra():
         return tuple(
             GlobalHydra.instance().config_loader().get_group_options(group, kind, "config")
@@ -233,7 +246,7 @@ def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
 
 @cache
 def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Keys that ``conf/config.yaml`` declares: nodes (mappings with `_target_`), plain values."""
+    """Return the keys of ``conf/config.yaml``: nodes (mappings with `_target_`), plain values."""
     plain: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))
     chosen = [key for entry in plain.pop("defaults") if isinstance(entry, dict) for key in entry]
     own = {key: value for key, value in plain.items() if key != "hydra"}
@@ -243,7 +256,7 @@ def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
-    """The plain values of a configuration; InputError as of `check_keys`."""
+    """Return the plain values of a configuration; InputError as of `check_keys`."""
     check_keys(config)
     plain: Any = OmegaConf.to_container(config, resolve=True)
     return cast("dict[str, Any]", plain)
@@ -251,14 +264,16 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 
 def check_keys(keys: Iterable[Any]) -> None:
     """Refuse a key that ``conf/config.yaml`` does not declare, naming the nearest that it does."""
-    known = [key for each in top_level() for key in each]
-    for key in (str(each) for each in keys if each not in known):
-        raise InputError(f"'{key}' is not a key of the configuration; {nearest(key, known)}.")
+    nodes, values = top_level()
+    known = (*nodes, *values)
+    for key in map(str, keys):
+        if key not in known:
+            raise InputError(f"'{key}' is not a key of the configuration; {nearest(key, known)}.")
 
 
 @contextmanager
 def own_hydra() -> Iterator[None]:
-    """Hydra with our configuration, also inside a command that Hydra runs."""
+    """Initialise Hydra with our configuration, also inside a command that Hydra runs."""
     register_resolvers()
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
@@ -281,8 +296,6 @@ def register_resolvers() -> None:
     ``${first:${.crop_hw}}``: the first entry of a list, which may itself be resolved; null of null.
     ``${embedded:120,null}``: 120 for an embedded data set, null for images of the user.
     """
-    defaults_list._create_interpolation_map = _choices_of_children  # type: ignore[assignment]
-    omegaconf.base.parse = _parsed_text  # type: ignore[attr-defined]
     resolvers: dict[str, Callable[..., Any]] = {
         "by_scale": _by_scale,
         "by_network": _by_network,
@@ -299,18 +312,8 @@ def _is_embedded(dataset: DictConfig) -> bool:
     return str(dataset.get("_target_")).startswith("rgbt.synth.")
 
 
-def _choices_of_children(overrides: Any, children: list[Any], self_added: bool) -> DictConfig:
-    """What a file's defaults are resolved with; Hydra makes it for files without defaults, too."""
-    return _create_interpolation_map(overrides, children, self_added) if children else _NO_CHOICES
-
-
-_create_interpolation_map, _NO_CHOICES = defaults_list._create_interpolation_map, DictConfig({})
-# OmegaConf parses the text of an interpolation whenever its value is read: a fifth of its time.
-_parsed_text = lru_cache(maxsize=4096)(omegaconf.grammar_parser.parse)
-
-
 def chosen_scale(scale: str, choices: Iterable[str]) -> str:
-    """The entry of `choices` for a scale: its own, or that of the scale whose files it shares."""
+    """Return the entry of `choices` for a scale: its own, or of the scale whose files it shares."""
     return scale if scale in choices else SAME_FILES.get(scale, scale)
 
 
@@ -330,12 +333,12 @@ def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
 
 
 def with_pixels(text: str, factor: float) -> str:
-    """`text` with the value of every ``${px:...}`` where images are `factor` times the paper's."""
+    """Replace every ``${px:...}`` in `text` where images are `factor` times the paper's."""
     return PIXELS.sub(lambda found: str(round(int(found[1]) * factor)), text)
 
 
 def flatten(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Leaves of plain values by dotted key, lists as they are."""
+    """Return the leaves of plain values by dotted key, lists as they are."""
     leaves: dict[str, Any] = {}
     for key, value in plain.items():
         inner = flatten(value) if isinstance(value, Mapping) else {"": value}

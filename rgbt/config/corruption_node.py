@@ -47,7 +47,7 @@ class ChosenCorruption(NamedTuple):
 
 
 def row_name(corruption: str) -> str:
-    """The name of a corruption in files of counts and rows of tables.
+    """Return the name of a corruption in files of counts and rows of tables.
 
     Args:
         corruption: ``NAME`` or ``NAME:IMAGE`` with the image "rgb", "thermal" or "both", such as
@@ -68,19 +68,19 @@ def corruption_files() -> dict[str, Path]:
 
 
 def standard_corruptions() -> list[str]:
-    """Every file of ``conf/corruption/`` with each image that its class can corrupt, by row."""
+    """Return every file of ``conf/corruption/`` with each image that its class can corrupt."""
     found = []
     for name, path in corruption_files().items():
         types = setting_types(constructor(load_config(path)["_target_"], NODE))
         images = get_args(types["image"]) if "image" in types else ("both",)
-        found += [name if each == "both" else f"{name}:{each}" for each in images]
+        found += [name if image == "both" else f"{name}:{image}" for image in images]
     return sorted(found, key=row_name)
 
 
 def choose_corruption(
     name: str, words: Sequence[str] = (), trust: Collection[str] = ()
 ) -> ChosenCorruption:
-    """The corruption NAME, NAME:IMAGE or FILE.yaml with ``corruption.KEY=VALUE``.
+    """Return the corruption NAME, NAME:IMAGE or FILE.yaml with ``corruption.KEY=VALUE``.
 
     `trust` are modules that the file may name (`rgbt.config.stored_config`).
     """
@@ -118,16 +118,16 @@ def choose_corruption(
 def choose_corruptions(
     text: str, words: Sequence[str], trust: Collection[str] = ()
 ) -> list[ChosenCorruption]:
-    """The corruptions of ``corruptions=``: names with commas, or "all"; each once."""
+    """Return the corruptions of ``corruptions=``: names with commas, or "all"; each once."""
     names = standard_corruptions() if text == "all" else split_list(text, "corruptions")
     others = [word for word in words if not word.startswith(f"{NODE}.seed=")]
     if others and len(names) > 1:
         raise InputError(f"'{others[0]}' is a setting of one corruption; corruptions={text}.")
     every = [choose_corruption(name, words, trust) for name in names]
-    return list({each.name: each for each in every}.values())
+    return list({corruption.name: corruption for corruption in every}.values())
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Overrides below ``corruption``, and the others."""
+    """Divide overrides into those below ``corruption`` and the others."""
     own = [word for word in overrides if word.startswith(f"{NODE}.")]
     return own, [word for word in overrides if word not in own]

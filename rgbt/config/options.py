@@ -33,14 +33,14 @@ class Help:
 
 
 def types_of(options: type) -> dict[str, Any]:
-    """Annotation of every option, by name."""
+    """Return the annotation of every option, by name."""
     return typing.get_type_hints(options, include_extras=True)
 
 
 def parse(
     options: type[T], words: Sequence[str], heeds: Sequence[str] | None = None
 ) -> tuple[T, list[str]]:
-    """The options that `words` set, and the words that are overrides of the configuration.
+    """Return the options that `words` set, and the words that are overrides of the configuration.
 
     Of these only the keys `heeds` take effect, each with all below it; None: all. InputError names
     a word that is no ``key=value``, an unknown key, or one whose value is wrong or missing.
@@ -55,14 +55,14 @@ def parse(
             values[key] = _read(key, with_home(text), kinds[key])
             continue
         if heeds is None:
-            from rgbt.config.command import check_key
+            from rgbt.config.overrides import check_key
 
             check_key(word, list(kinds))
         else:
             # The search path names the folder of a user's own data set files.
             known = (*heeds, "hydra.searchpath") if heeds else ()
             key = key.lstrip("+~")
-            if not any(f"{key}.".startswith(f"{each}.") for each in known):
+            if not any(f"{key}.".startswith(f"{name}.") for name in known):
                 raise InputError(f"'{key}' has no effect here; {nearest(key, [*kinds, *heeds])}.")
         overrides.append(word)
     for name in _required(options):
@@ -73,11 +73,11 @@ def parse(
 
 def _required(options: Any) -> list[str]:
     fields = dataclasses.fields(options)
-    return [each.name for each in fields if each.default is each.default_factory is MISSING]
+    return [option.name for option in fields if option.default is option.default_factory is MISSING]
 
 
 def _read(key: str, text: str, annotation: Any) -> Any:
-    """The text as it is, as YAML, or as a list: the first that the annotation takes."""
+    """Return the text as it is, as YAML, or as a list: the first that the annotation takes."""
     from pydantic import ConfigDict, TypeAdapter, ValidationError
 
     from rgbt.config.values import refusal
@@ -89,9 +89,9 @@ def _read(key: str, text: str, annotation: Any) -> Any:
         with suppress(InputError):
             candidates.append(read(text, key))
     errors = []
-    for each in candidates:
+    for candidate in candidates:
         try:
-            return adapter.validate_python(each)
+            return adapter.validate_python(candidate)
         except ValidationError as error:
             errors.append(error)
     # For a list or mapping, the error of the text read as YAML names the wrong entry.
@@ -99,20 +99,20 @@ def _read(key: str, text: str, annotation: Any) -> Any:
 
 
 def choices_of(annotation: Any) -> list[str]:
-    """The texts that an annotation names one by one."""
+    """Return the texts that an annotation names one by one."""
     inner = typing.get_args(annotation)
     if typing.get_origin(annotation) is Literal:
-        return [each for each in inner if isinstance(each, str)]
-    return [choice for each in inner for choice in choices_of(each)]
+        return [choice for choice in inner if isinstance(choice, str)]
+    return [choice for part in inner for choice in choices_of(part)]
 
 
 def with_home(text: str) -> str:
-    """`text` with ~ at its start as the home folder: shells keep it after "="."""
+    """Replace ~ at the start of `text` by the home folder: shells keep it after "="."""
     return re.sub(r"^~(?=/|$)", str(Path.home()), text)
 
 
 def readable_paths(words: Sequence[str]) -> list[str]:
-    """Arguments as Hydra reads them: ~ is the home folder, and paths (epoch=299.ckpt) are quoted.
+    """Write arguments as Hydra reads them: ~ is the home folder, paths (epoch=299.ckpt) are quoted.
 
     A comma still makes a grid, and names of upstream runs (experiment:NAME/last.pt) stay.
     """
@@ -128,7 +128,7 @@ def readable_paths(words: Sequence[str]) -> list[str]:
 
 
 def help_text(usage: str, options: type, about: str, given: str = "") -> str:
-    """What ``--help`` shows; `usage` is the command as it is typed, with the option `given`."""
+    """Return the text of ``--help``; `usage` is the command as typed, with the option `given`."""
     summary, _, rest = about.partition("\n\n")
     needed = [f"{name}=..." for name in _required(options) if name != given]
     kinds = types_of(options)
@@ -137,14 +137,14 @@ def help_text(usage: str, options: type, about: str, given: str = "") -> str:
         WIDTH, subsequent_indent=" " * width, break_on_hyphens=False, break_long_words=False
     ).fill
     lines = []
-    for each in dataclasses.fields(options):
-        notes = getattr(kinds[each.name], "__metadata__", ())
+    for option in dataclasses.fields(options):
+        notes = getattr(kinds[option.name], "__metadata__", ())
         text = "; ".join(note.text for note in notes if isinstance(note, Help))
-        choices = choices_of(kinds[each.name])
+        choices = choices_of(kinds[option.name])
         if not all(re.search(rf"\b{re.escape(choice)}\b", text) for choice in choices):
             text += f"; one of: {', '.join(choices)}"
-        if each.default not in (None, MISSING, "") and "default" not in text:
-            text += f" (default: {each.default})"
-        lines.append(fill(f"  {each.name}".ljust(width) + text))
+        if option.default not in (None, MISSING, "") and "default" not in text:
+            text += f" (default: {option.default})"
+        lines.append(fill(f"  {option.name}".ljust(width) + text))
     usage = " ".join(["usage:", usage, *needed, "[option=value ...]"])
     return "\n\n".join(filter(None, [summary, usage, "\n".join(lines), rest]))

@@ -74,7 +74,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         if library == "submitit":  # a job that was lost, or reached its time limit
             return say(str(error), 1)
         if library in ("hydra", "omegaconf"):
-            from rgbt.config.command import hydra_sentence  # --help does not wait for Hydra
+            from rgbt.config.overrides import hydra_sentence  # --help does not wait for Hydra
 
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
@@ -88,7 +88,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
 
 
 def _with_setting(file: str) -> str:
-    """A path after the word of the command line that names it, or a folder above it."""
+    """Return a path after the word of the command line that names it, or a folder above it."""
     found, path = "", Path(file).absolute()
     for word in sys.argv[1:]:
         value = word.partition("=")[2]

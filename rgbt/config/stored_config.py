@@ -36,19 +36,19 @@ FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else na
 
 
 def load_config(path: Path, trust: Collection[str] = (), group: str = "") -> DictConfig:
-    """A stored configuration whose objects may be built (see `check_targets`)."""
+    """Return a stored configuration whose objects may be built (see `check_targets`)."""
     settings = read_settings(path)
     check_targets(settings, trust, str(path), group)
     return OmegaConf.create(settings)
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Plain values of a stored configuration (see `settings_of`), from which nothing is built."""
+    """Read the plain values of a stored configuration (see `settings_of`); nothing is built."""
     return settings_of(read_yaml(path), str(path))
 
 
 def settings_of(plain: Any, source: str) -> dict[str, Any]:
-    """`plain`; InputError if it is no mapping with texts as keys or has an interpolation."""
+    """Return `plain`; InputError: it is no mapping with texts as keys, or has an interpolation."""
     if not isinstance(plain, dict):
         raise InputError(f"{source}: expected a mapping of keys and values, got {_shown(plain)}.")
     for key, value in _walk(plain):
@@ -68,10 +68,10 @@ def check_targets(
     `trust` has modules, single targets and folders of checkouts; `source` is for messages; only the
     files of the folder `group` of ``conf/``, such as "masker", say what is shipped.
     """
-    folders = [Path(each).expanduser().resolve() for each in trust if each.startswith(FOLDERS)]
+    folders = [Path(word).expanduser().resolve() for word in trust if word.startswith(FOLDERS)]
     for key, checkout in checkouts(settings).items():
         folder = Path(checkout).expanduser().resolve()
-        if not any(folder.is_relative_to(each) for each in folders):
+        if not any(folder.is_relative_to(trusted) for trusted in folders):
             raise InputError(
                 f"{source}: '{_shown(key)}' is {_shown(checkout)}, whose code would be executed. "
                 f"If you trust it, add trust={_shown(str(folder))}; or set {_shown(key)}=..."
@@ -94,16 +94,19 @@ def check_targets(
 
 
 def targets(settings: Any) -> dict[str, Any]:
-    """Every ``_target_`` by its dotted key, inside lists too."""
+    """Return every ``_target_`` by its dotted key, inside lists too."""
     return {key: value for key, value in _walk(settings) if key.rpartition(".")[2] == "_target_"}
 
 
 def checkouts(settings: Any) -> dict[str, str]:
-    """Every folder whose code `EXTERNAL` would execute, by its dotted key."""
+    """Return every folder whose code `EXTERNAL` would execute, by its dotted key."""
     found = dict(_walk(settings))
-    nodes = (key.rpartition(".")[0] for key, each in found.items() if each == EXTERNAL)
-    keys = (f"{node}.checkout".lstrip(".") for node in nodes)
-    return {key: str(found[key]) for key in keys if key in found}
+    folders = {}
+    for key, value in found.items():
+        checkout = f"{key.rpartition('.')[0]}.checkout".lstrip(".")
+        if value == EXTERNAL and checkout in found:
+            folders[checkout] = str(found[checkout])
+    return folders
 
 
 def check_words(words: Iterable[str], source: str) -> None:
@@ -122,7 +125,7 @@ def check_words(words: Iterable[str], source: str) -> None:
 
 
 def parse_trust(text: str) -> tuple[str, ...]:
-    """Modules and folders (see `FOLDERS`) of ``trust=my.module,/code/GMNet``."""
+    """Return the modules and folders (see `FOLDERS`) of ``trust=my.module,/code/GMNet``."""
     words = split_list(text, "modules") if text else []
     for word in words:
         if not DOTTED.fullmatch(word) and not word.startswith(FOLDERS):
@@ -132,13 +135,13 @@ def parse_trust(text: str) -> tuple[str, ...]:
 
 @cache
 def shipped_targets(group: str = "") -> frozenset[str]:
-    """Targets inside `rgbt` that files of ``conf/`` (of ``conf/<group>/``) name."""
+    """Return the targets inside `rgbt` that files of ``conf/`` (of ``conf/<group>/``) name."""
     files = (conf_dir() / group).rglob("*.yaml")
     return frozenset(name for path in files for name in NAMED.findall(path.read_text()))
 
 
 def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted key and value of everything below `node`, which is at most 50 levels deep."""
+    """Yield the dotted key and value of everything below `node`, at most 50 levels deep."""
     parts = dict(enumerate(node)) if isinstance(node, list) else node
     for key, value in parts.items() if isinstance(parts, Mapping) else ():
         if not isinstance(key, str | int):  # a number is a value of a label, in `dataset.ids`
@@ -153,5 +156,5 @@ def _is_inside(name: str, modules: Collection[str]) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """Text of a stranger's without control characters, cut."""
+    """Cut a text of a stranger's, without its control characters."""
     return ascii(value).strip("'\"")[:100]

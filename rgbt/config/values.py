@@ -18,7 +18,7 @@ KINDS = ("int", "float", "str", "bool", "dict", "list", "tuple")
 
 
 def check_value(path: str, value: Any, annotation: Any) -> Any:
-    """Plain YAML as the annotated type; as in JSON, a list may be a tuple and an int a float.
+    """Convert plain YAML to the annotated type; as in JSON, a list may be a tuple, an int a float.
 
     Raises:
         InputError: another type, a value out of its range, NaN or infinity; `path` is named.
@@ -38,7 +38,7 @@ def check_value(path: str, value: Any, annotation: Any) -> Any:
 
 
 def _not_finite(path: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Dotted key and value of every NaN and infinity in plain YAML."""
+    """Yield the dotted key and value of every NaN and infinity in plain YAML."""
     if isinstance(value, float) and not math.isfinite(value):
         yield path, value
     for key, inner in value.items() if isinstance(value, dict) else ():
@@ -55,7 +55,7 @@ def _adapter(annotation: Any) -> Any:
 
 
 def refusal(path: str, error: pydantic.ValidationError) -> InputError:
-    """The first message of pydantic, with the key of the refused value in front; below `path`."""
+    """Return pydantic's first message after the key of the refused value, which is below `path`."""
     first = error.errors()[0]
     for step in first["loc"]:
         if isinstance(step, int):

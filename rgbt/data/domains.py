@@ -9,7 +9,7 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.ranges import ShareBelowOne, Text
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import DomainsRecord, Requirement
 from rgbt.types import View
 
 GIVEN, NONE = "given", "none"
@@ -94,11 +94,11 @@ class Domains:
             )
 
     @property
-    def record(self) -> Record:
+    def record(self) -> DomainsRecord:
         """What the domains provide, and what they require of other components."""
         of_two = Requirement("scheme", "num_domains", 2)
         named = self.named.items()
-        return Record(
+        return DomainsRecord(
             requires=(
                 *((of_two,) if self.target is not None else ()),
                 *(each for name, domain in named for each in domain.requires(f"domains.{name}")),

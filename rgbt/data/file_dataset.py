@@ -17,7 +17,7 @@ from rgbt.data.files import read_names, stored_hw, within
 from rgbt.data.images import PairReader, Range, check_size
 from rgbt.data.labels import LabelCodes
 from rgbt.data.patterns import Frame, Patterns
-from rgbt.requirements import Record
+from rgbt.requirements import DatasetRecord
 from rgbt.types import Sample
 
 # Split -> its list file, or several, whose names are all in the split.
@@ -81,10 +81,12 @@ class FileDataset:
         self._names: dict[str, tuple[str, ...]] = {}
 
     @property
-    def record(self) -> Record:
+    def record(self) -> DatasetRecord:
         """The number of its classes, and what the first one is."""
         first = self.classes[0] in self.background
-        return Record(num_classes=self.num_classes, first_class="background" if first else "object")
+        return DatasetRecord(
+            num_classes=self.num_classes, first_class="background" if first else "object"
+        )
 
     def check_classes(self, **settings: tuple[str, ...]) -> None:
         """Refuse settings that name what is not one of its classes (InputError)."""

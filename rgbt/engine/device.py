@@ -19,7 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from rgbt.checks import InputError
 from rgbt.engine.settings import Precision, TrainerSettings
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 # `trainer.compile` -> mode of torch.compile. With CUDA graphs, the passes of one step would
@@ -109,7 +109,10 @@ class Compiled:
 
 def recompute_activations(network: nn.Module) -> None:
     """Compute activations of the modules in `Record.recomputed`, which draw nothing, again."""
-    patterns = [re.escape(each).replace(r"\*", "[^.]*") for each in record_of(network).recomputed]
+    patterns = [
+        re.escape(each).replace(r"\*", "[^.]*")
+        for each in record_of(network, NetworkRecord).recomputed
+    ]
     pattern = re.compile("|".join(patterns))
     modules = [each for name, each in network.named_modules() if name and pattern.fullmatch(name)]
     if not modules:

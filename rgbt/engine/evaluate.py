@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from rgbt.checks import RunError
 from rgbt.class_scores import classes_of
 from rgbt.engine.prediction import WHOLE, Prediction
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from rgbt.types import Batch, View
 
 FAINTEST = 1e-6  # smallest sum of scores of masks that is a denominator
@@ -33,7 +33,7 @@ def shares(scores: Tensor, model: nn.Module) -> Tensor:
     That is their softmax. Scores of networks that return masks are sums over queries (Mask2Former,
     semantic inference), whose softmax would hardly differ; each is divided by the sum over classes.
     """
-    if record_of(model).outputs == "masks":
+    if record_of(model, NetworkRecord).outputs == "masks":
         return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
     return scores.softmax(1)
 

@@ -11,7 +11,7 @@ import torch
 from rgbt.checks import InputError, RunError
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import num_processes
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 
 # Of the allocators of CUDA, cuDNN and MPS, and of torch on the CPU.
 NO_MEMORY = re.compile("out of memory|_ALLOC_FAILED|can't allocate memory|not enough memory")
@@ -34,7 +34,7 @@ def naming_memory(device: torch.device, what: str, advice: str) -> Iterator[None
 
 
 def training_advice(
-    trainer: TrainerSettings, batch_size: int, network: Record, crop_hw: object
+    trainer: TrainerSettings, batch_size: int, network: NetworkRecord, crop_hw: object
 ) -> str:
     """Settings with which a training needs less: those that resume it, and those of a new run."""
     same, other = [], []

@@ -17,7 +17,7 @@ from annotated_types import Interval
 from torch import nn
 
 from rgbt.ranges import Epsilon, LearningRate, NonNegative, ShareBelowOne
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table", "layer_scale_1", "layer_scale_2")
@@ -128,7 +128,7 @@ def parameter_groups(
     `without` are beginnings of names that are left out ("heads.target."); ValueError: no such name.
     """
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
-    parts = record_of(model).pretrained_parts
+    parts = record_of(model, NetworkRecord).pretrained_parts
     for beginning in without:
         if not any(name.startswith(beginning) for name, _ in model.named_parameters()):
             raise ValueError(f"without: no parameter's name begins with '{beginning}'.")

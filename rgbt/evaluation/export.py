@@ -26,7 +26,7 @@ from rgbt.exported.onnx_network import (
     require_packages,
 )
 from rgbt.files.atomic import write_atomic
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 
 NO_TRACKING = "rgbt.tracking.tracker.Tracking"
 
@@ -105,7 +105,7 @@ def export(
         classes=tuple(session.dataset.classes),
         view=predictor.view,
         head=head,
-        outputs=record_of(session.model).outputs,
+        outputs=record_of(session.model, NetworkRecord).outputs,
         image_hw=size,
         dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.

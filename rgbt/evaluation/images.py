@@ -19,9 +19,9 @@ from torch import nn
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_range
 from rgbt.class_scores import best_of
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
+from rgbt.config.overrides import composing
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import collate, eval_batches
 from rgbt.data.new_images import ToPredict, of_files, of_path, of_split

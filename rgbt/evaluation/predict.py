@@ -17,7 +17,7 @@ from rgbt.class_scores import best_of, classes_of
 from rgbt.config.common_options import AS_TRAINED
 from rgbt.data.domains import TestedHead
 from rgbt.engine.evaluate import label_scores, shares
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from rgbt.transforms.maps import bilinear, mixed, nearest
 from rgbt.types import VIEWS, Batch, View
 
@@ -89,7 +89,7 @@ def chosen(modality: str, head: str = AS_TRAINED) -> tuple[View | None, TestedHe
 
 def view_of(session: Session, view: View | None = None) -> View:
     """Return the view that a network predicts from; None: of its source domain, or its first."""
-    known = record_of(session.model).views
+    known = record_of(session.model, NetworkRecord).views
     if view is None:
         return session.domains.source.view or known[0]
     check_choice("modality", view, known)

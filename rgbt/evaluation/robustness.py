@@ -16,7 +16,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.scores import summary
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from rgbt.tables import TextTable, csv_text, percent
 from rgbt.types import View
 
@@ -31,7 +31,7 @@ def conditions(
 ) -> Iterator[tuple[Session, Measurement]]:
     """Yield clean images, single branches if the network decodes them, and every severity."""
     yield session, measurement_of(session, split)
-    known = record_of(session.model).views
+    known = record_of(session.model, NetworkRecord).views
     for branch in BRANCHES if view_of(session) == "rgbt" else ():
         if branch in known:
             yield session, measurement_of(session, split, branch)

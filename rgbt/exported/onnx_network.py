@@ -22,7 +22,7 @@ from torch import Tensor, nn
 import rgbt
 from rgbt.checks import InputError, one_line
 from rgbt.files.plain_files import disguise, parse_json, read_bytes
-from rgbt.requirements import Outputs, Record, record_of
+from rgbt.requirements import NetworkRecord, Outputs, record_of
 from rgbt.types import Output, View
 
 # Prefix of every name in the metadata of a file.
@@ -150,11 +150,11 @@ class ExportedNetwork(nn.Module):
         return cls(read_bytes(path), path)
 
     @property
-    def record(self) -> Record:
+    def record(self) -> NetworkRecord:
         """Return the one view, and the one head, that the graph was made for."""
         made = self.description
         heads = (made.head,) if made.head else ()
-        return Record(outputs=made.outputs, views=(made.view,), heads=heads)
+        return NetworkRecord(outputs=made.outputs, views=(made.view,), heads=heads)
 
     def forward(
         self, rgb: Tensor, thermal: Tensor, *, views: tuple[View, ...] = (), head: str | None = None
@@ -254,7 +254,7 @@ def exported_network(
         network=type(network).__name__,
         classes=tuple(map(str, range(scores.shape[1]))),
         view=view,
-        outputs=record_of(network).outputs,
+        outputs=record_of(network, NetworkRecord).outputs,
         image_hw=image_hw,
         settings={},
     )

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import LossRecord, Requirement, record_of
 from rgbt.types import IGNORE, Batch, Loss, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
@@ -53,7 +53,7 @@ class CrossEntropy:
             setting = f"loss.class_weights={list(class_weights)}"
             required.append(Requirement("dataset", "num_classes", len(class_weights), setting))
         self.class_weights = class_weights
-        self.record = Record(requires=tuple(required), weighs_confidence=self.weighs_confidence)
+        self.record = LossRecord(requires=tuple(required), weighs_confidence=self.weighs_confidence)
 
     def __call__(
         self,
@@ -118,9 +118,9 @@ class WithAuxiliary:
     weight: NonNegative
 
     @property
-    def record(self) -> Record:
+    def record(self) -> LossRecord:
         """That of `loss`, and a network with an auxiliary head."""
-        record = record_of(self.loss)
+        record = record_of(self.loss, LossRecord)
         auxiliary = Requirement("model", "auxiliary", True)
         return replace(record, requires=(*record.requires, auxiliary), reads_auxiliary=True)
 

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from rgbt.losses.cross_entropy import TINY, ClassPixels, ClassWeights, Computed, CrossEntropy
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative, Power, Share
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import LossRecord, Requirement
 from rgbt.types import IGNORE, Batch, Output
 
 
@@ -124,7 +124,7 @@ class LovaszSoftmax:
 
     def __init__(self, *, cross_entropy: NonNegative) -> None:
         self.weight, self.other = cross_entropy, CrossEntropy(class_weights=None)
-        self.record = Record(requires=(Requirement("model", "outputs", "scores"),))
+        self.record = LossRecord(requires=(Requirement("model", "outputs", "scores"),))
 
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator

@@ -26,7 +26,7 @@ from rgbt.losses.points import EVERY, Points, class_shares, most_uncertain, samp
 from rgbt.losses.spatial import PLAIN, PointWeights, SpatialMap, SpatialWeight
 from rgbt.processes import mean_count, num_processes, rank, whole
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import LossRecord, Requirement
 from rgbt.types import IGNORE, Batch, Output
 
 # Size of the largest temporary of a step. A larger one does not fit in the processor's cache.
@@ -71,10 +71,10 @@ class SetCriterion:
         }
 
     @property
-    def record(self) -> Record:
+    def record(self) -> LossRecord:
         """Masks of as many classes."""
         setting = f"loss.num_classes={self.num_classes}"
-        return Record(
+        return LossRecord(
             requires=(
                 Requirement("model", "outputs", "masks"),
                 Requirement("dataset", "num_classes", self.num_classes, setting),

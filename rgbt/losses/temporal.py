@@ -18,7 +18,7 @@ from rgbt.geometry.warp import halved_label, halved_mean
 from rgbt.losses.cross_entropy import single
 from rgbt.processes import total
 from rgbt.ranges import NonNegative
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import LossRecord, Requirement, record_of
 from rgbt.types import IGNORE, Frame, Loss
 
 Form = Literal["paper", "released"]  # the choices of Temporal's paper, or of its release
@@ -52,15 +52,15 @@ class TemporalLoss:
             )
 
     @property
-    def record(self) -> Record:
+    def record(self) -> LossRecord:
         """The requirements of the loss of each frame, and a scheme of two frames."""
         own = [Requirement("scheme", "frames", 2)]
         # As released, Dice and con_acc leave out class 0.
         if self.form == "released" and (self.alpha or self.second in ("dice", "con_acc")):
             own += [Requirement.of_background("loss.form=released")]
         compares = self.second in ("con", "con_acc")
-        return Record(
-            requires=(*record_of(self.segmentation).requires, *own),
+        return LossRecord(
+            requires=(*record_of(self.segmentation, LossRecord).requires, *own),
             frames=2,
             reads_warped=compares,
             compares_half=compares,

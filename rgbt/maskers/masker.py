@@ -16,7 +16,7 @@ from torch import Tensor
 from rgbt.checks import InputError, check_members, described
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.ranges import Pixels, Share
-from rgbt.requirements import Record
+from rgbt.requirements import MaskerRecord
 from rgbt.types import MaskPair
 
 Sampler = Literal["none", "uniform", "bernoulli", "square", "gaussian_count", "gaussian_bernoulli"]
@@ -71,9 +71,9 @@ class Masker:
     pattern_probabilities: tuple[Share, Share, Share] | None
 
     @property
-    def record(self) -> Record:
+    def record(self) -> MaskerRecord:
         """Cells are hidden, but by the sampler "none"; a scheme then omits the masked pass."""
-        return Record(hides_cells=self.sampler != "none")
+        return MaskerRecord(hides_cells=self.sampler != "none")
 
     def __post_init__(self) -> None:
         needed = NEEDED[self.sampler] | {"sampler"}

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.ranges import BaseWidth, Channels
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import NetworkRecord, Requirement
 
 
 class Critic(nn.Module):
@@ -36,7 +36,7 @@ class Critic(nn.Module):
         )
         setting = f"scheme.critic.in_channels={in_channels}"
         need = Requirement("dataset", "num_classes", in_channels, setting)
-        self.record = Record(requires=(need,))
+        self.record = NetworkRecord(requires=(need,))
 
     def forward(self, x: Tensor) -> Tensor:
         """Verdicts, not squashed; which number stands for which domain is the loss's choice.

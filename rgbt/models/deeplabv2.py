@@ -15,7 +15,7 @@ from rgbt.checks import InputError, check_choice
 from rgbt.models.inputs import Images, Inputs, Network, as_rgb
 from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import NetworkRecord, Requirement
 from rgbt.types import Output, View
 
 TrainNorm = Literal["all", "statistics"]
@@ -134,7 +134,7 @@ class DeepLabV2(Network):
             raise InputError(f"model.summed_rates must be some of {rates}, got {summed_rates}.")
         if ceil_mode and decoder != "basic":
             raise InputError(f"model.ceil_mode must be false with model.decoder={decoder}.")
-        self.record = Record(
+        self.record = NetworkRecord(
             requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
             views=("rgb", "thermal"),
             heads=heads,

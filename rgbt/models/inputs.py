@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.geometry.padding import padded_hw
 from rgbt.ranges import GreyLevel
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import MaskPair, Output, View
 
 
@@ -107,7 +107,7 @@ class Network(nn.Module):
     `predict(images, view, generator)`, whose docstring says what it adds to `rgbt.models`.
     """
 
-    record: Record
+    record: NetworkRecord
     inputs: Inputs
     multiple = 1
     predict: Any

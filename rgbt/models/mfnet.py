@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.ranges import Channels, NumClasses
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
 
 Widths = tuple[Channels, Channels, Channels, Annotated[Channels, MultipleOf(2)]]
@@ -65,7 +65,7 @@ class MFNet(Network):
     """
 
     multiple = 16  # four halvings, which the decoder undoes exactly
-    record = Record(views=("rgbt",), recomputed=("conv*", "decode*"))
+    record = NetworkRecord(views=("rgbt",), recomputed=("conv*", "decode*"))
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
 
 BINS = (1, 2, 3, 6)  # cells per side of the pooled maps (PSPNet, Sec. 3.2)
@@ -51,7 +51,7 @@ class PSPNet(Network):
         super().__init__()
         self.num_classes = num_classes
         fused = modalities in ("late_fusion", "early_fusion")
-        self.record = Record(
+        self.record = NetworkRecord(
             views=("rgbt",) if fused else ("rgb",) if modalities == "rgb" else ("thermal",),
             features=True,
             pretrained_parts=("feats.",),

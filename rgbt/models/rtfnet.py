@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.models.parts import basic_stage, bottleneck_stage
 from rgbt.ranges import BaseWidth, NumClasses
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
 
 # Depth of a ResNet -> blocks of its stages (He et al., Table 1).
@@ -90,7 +90,7 @@ class RTFNet(Network):
         self.num_classes = num_classes
         # Parameters of the stem that ImageNet weights do not cover.
         anew = {"encoder_thermal_conv1.": "drawn anew with model.thermal_stem=xavier"}
-        self.record = Record(
+        self.record = NetworkRecord(
             views=("rgbt",),
             features=True,
             pretrained_parts=("encoder_",),

@@ -13,7 +13,7 @@ from rgbt.models.inputs import Images, Inputs, Network, as_rgb
 from rgbt.models.parts import bottleneck_stage, drop_channels
 from rgbt.models.pspnet import BINS
 from rgbt.ranges import BaseWidth, Depths, NumClasses, ShareBelowOne
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
 
 
@@ -42,7 +42,7 @@ class SemsegPSPNet(Network):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
-        self.record = Record(
+        self.record = NetworkRecord(
             views=(modalities,),
             auxiliary=True,
             features=True,

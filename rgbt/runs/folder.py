@@ -16,8 +16,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
+from annotated_types import Len
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
 from rgbt.checks import InputError, one_line
@@ -67,7 +68,7 @@ class MetricLine:
 
     @classmethod
     def read_all(cls, lines: Sequence[bytes]) -> list[MetricLine]:
-        """The lines as objects; ValueError where one is damaged."""
+        """Return the lines as objects; ValueError where one is damaged."""
         if any(line != _sealed_line(line[:-SEAL_LENGTH]) for line in lines):
             raise ValueError(UNLIKE_SEAL)
         bodies = (line[:-SEAL_LENGTH] + b"}" for line in lines)
@@ -78,7 +79,7 @@ class MetricLine:
         return found
 
     def text(self) -> bytes:
-        """The line as it is written, with the checksum of its bytes as the last entry."""
+        """Return the line as it is written, with the checksum of its bytes as the last entry."""
         finite = {key: v if math.isfinite(v) else None for key, v in self.values.items()}
         body = json.dumps({**vars(self), "values": finite}).encode()
         return _sealed_line(body[:-1]) + b"\n"
@@ -104,7 +105,7 @@ class Description:
 
 
 def lists_of(params: Mapping[str, str]) -> str:
-    """Which lists a run was trained and its checkpoint selected on, of its parameters.
+    """Return which lists a run was trained and its checkpoint selected on, of its parameters.
 
     "trained on train.txt + val.txt, selected on val.txt"; a split without a list by its name.
     """
@@ -118,13 +119,6 @@ def lists_of(params: Mapping[str, str]) -> str:
     if params.get("trainer.tested") == "last":
         selected = "last checkpoint"
     return f"trained on {named(params.get('domains.source.split', 'train'))}, {selected}"
-
-
-class MarkerForm(TypedDict):
-    """``dataset.json``: digests of names and files of the images."""
-
-    names: str
-    files: str
 
 
 class ResultForm(TypedDict, total=False):
@@ -142,45 +136,46 @@ class ResultForm(TypedDict, total=False):
     test: dict[str, float | None]
 
 
-class ProvenanceForm(TypedDict):
-    """``provenance.json``: an entry of every process."""
+# ``dataset.json``: digests of names and files of the images.
+MARKER = Annotated[dict[Literal["names", "files"], str], Len(2)]
 
-    processes: list[dict[str, Any]]
+# ``provenance.json``: an entry of every process; a list of them in the archive.
+PROVENANCE = Annotated[dict[Literal["processes"], list[dict[str, Any]]], Len(1)]
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the run in `folder` is finished."""
+    """Say whether the run in `folder` is finished."""
     return (folder / "result.json").is_file()
 
 
 def run_key(folder: Path) -> str:
-    """The config key of the run in `folder`, which may be a replaced one: ``<key>-<n>``."""
+    """Return the config key of the run in `folder`, which may be a replaced one: ``<key>-<n>``."""
     is_replaced = folder.parent.name == REPLACED
     return folder.name.rpartition("-")[0] if is_replaced else folder.name
 
 
 def counts_name(split: str) -> str:
-    """Name of the file of the counts that a run ended with."""
+    """Return the name of the file of the counts that a run ended with."""
     return f"counts_{split}.npz"
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:
-    """``result.json``; None: not finished. This and the others: InputError if damaged."""
+    """Read ``result.json``; None: not finished. This and the others: InputError if damaged."""
     return cast("dict[str, Any] | None", _read(folder / "result.json", ResultForm))
 
 
 def read_description(folder: Path) -> Description | None:
-    """``run.json``; None: there is none."""
+    """Read ``run.json``; None: there is none."""
     return cast("Description | None", _read(folder / "run.json", Description))
 
 
-def read_marker(folder: Path) -> MarkerForm | None:
-    """``dataset.json``; None: there is none."""
-    return cast("MarkerForm | None", _read(folder / "dataset.json", MarkerForm))
+def read_marker(folder: Path) -> dict[str, str] | None:
+    """Read ``dataset.json``; None: there is none."""
+    return cast("dict[str, str] | None", _read(folder / "dataset.json", MARKER))
 
 
 def read_tables(folder: Path) -> ResultTables | None:
-    """``tables.json``; None: there is none."""
+    """Read ``tables.json``; None: there is none."""
     path = folder / "tables.json"
     plain = _read(path, dict[str, Any])
     try:
@@ -190,8 +185,8 @@ def read_tables(folder: Path) -> ResultTables | None:
 
 
 def read_provenance(file: Path) -> list[dict[str, Any]]:
-    """Entries of a ``provenance.json``, one per process, the first one first; [] without a file."""
-    found = _read(file, ProvenanceForm | list[dict[str, Any]])  # a list: of the archive
+    """Read a ``provenance.json``: an entry per process, the first one first; [] without a file."""
+    found = _read(file, PROVENANCE | list[dict[str, Any]])
     entries = found["processes"] if isinstance(found, dict) else found or []
     return cast("list[dict[str, Any]]", entries)
 
@@ -228,7 +223,7 @@ class RunFolder:
             pass
 
     def is_locked(self) -> bool:
-        """Whether a process is training here now."""
+        """Say whether a process is training here now."""
         return is_held(self.path / "lock")
 
     def write_config(self, text: str) -> None:
@@ -257,7 +252,7 @@ class RunFolder:
             file.write(MetricLine(step, kind, round(time.time(), 3), plain).text())
 
     def lines(self) -> list[MetricLine]:
-        """Lines of ``metrics.jsonl``; InputError for a damaged one, but not for a cut last one."""
+        """Read ``metrics.jsonl``; InputError for a damaged line, but not for a cut last one."""
         path = self.path / "metrics.jsonl"
         *whole, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
         if SEALED.search(last):  # whole but for its end
@@ -290,7 +285,7 @@ class RunFolder:
         return found
 
     def figure_path(self, name: str) -> Path:
-        """Path of the picture `name`; its folder is made."""
+        """Return the path of the picture `name`; its folder is made."""
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
         return folder / f"{name}.png"
@@ -303,13 +298,13 @@ class RunFolder:
         """Mark the run as finished; everything else must be written before."""
         write_json(self.path / "result.json", result)
 
-    def mark(self, marker: MarkerForm) -> None:
+    def mark(self, marker: Mapping[str, str]) -> None:
         """Write ``dataset.json``, which identifies the images."""
         write_json(self.path / "dataset.json", marker)
 
 
 def runs_in(runs_dir: Path | str) -> list[RunFolder]:
-    """Every run folder in `runs_dir`, by name, with a warning for one that is refused."""
+    """Return every run folder in `runs_dir`, by name, with a warning for one that is refused."""
     root, found = Path(runs_dir), []
     if not root.is_dir():
         raise InputError(f"runs_dir={root}: the folder does not exist.")
@@ -322,7 +317,7 @@ def runs_in(runs_dir: Path | str) -> list[RunFolder]:
 
 
 def find_run(run: str, runs_dir: Path) -> Path:
-    """The folder of a run given as a folder, key or MLflow run id; InputError if there is none."""
+    """Find the folder of a run by folder, key or MLflow run id; InputError: there is none."""
     for folder in (Path(run), runs_dir / run):
         if (folder / "config.yaml").is_file():
             return RunFolder(folder).path
@@ -352,17 +347,17 @@ def set_aside(folder: RunFolder) -> RunFolder | None:
 
 
 def runs_dir_of(folder: RunFolder) -> Path:
-    """The folder of runs that a run belongs to, replaced or not."""
+    """Return the folder of runs that a run belongs to, replaced or not."""
     return folder.path.parents[folder.path.parent.name == REPLACED]
 
 
 def shown_key(folder: RunFolder) -> str:
-    """The key of a run as a tracker shows it: `<key>`, or `replaced/<key>-<n>`."""
+    """Return the key of a run as a tracker shows it: `<key>`, or `replaced/<key>-<n>`."""
     return str(folder.path.relative_to(runs_dir_of(folder)))
 
 
 def shown_description(folder: RunFolder) -> Description | None:
-    """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
+    """Describe a run for a tracker; a replaced one is in no group, and its key is its folder."""
     known = read_description(folder.path)
     if known is None or folder.path.parent.name != REPLACED:
         return known

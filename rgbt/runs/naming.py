@@ -87,7 +87,7 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
 
 
 def tags_from_environment() -> dict[str, str]:
-    """The MLflow tags that a sweep gives to the run that it requests (`TAGS`).
+    """Return the MLflow tags that a sweep gives to the run that it requests (`TAGS`).
 
     Raises:
         InputError: the variable does not hold a JSON mapping.
@@ -100,7 +100,7 @@ def tags_from_environment() -> dict[str, str]:
 
 
 def _short(word: str) -> str:
-    """A word without quotes; a long value cut in the middle, and kept distinct by a digest."""
+    """Remove quotes of a word, and cut a long value in its middle, where a digest tells it."""
     key, equals, value = word.partition("=")
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         value = value[1:-1]

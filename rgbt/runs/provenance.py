@@ -49,19 +49,19 @@ SECRETS = (
 
 
 def without_passwords(text: str) -> str:
-    """`text` with ``***`` for credentials (`SECRETS`); applied twice it gives the same."""
+    """Write ``***`` for credentials in `text` (`SECRETS`); applied twice it gives the same."""
     for pattern in SECRETS:
         text = re.sub(pattern, rf"\1{HIDDEN}", text, flags=re.IGNORECASE)
     return text
 
 
 def command_line(words: Sequence[str]) -> str:
-    """A command as one types it, without passwords: quotes of the shell do not end one."""
+    """Return a command as one types it, without passwords: quotes of the shell do not end one."""
     return shlex.join(map(without_passwords, words))
 
 
 def provenance() -> dict[str, Any]:
-    """The record of how this process makes its results: `code`, `packages`, `machine`, and
+    """Return the record of how this process makes its results: `code`, `packages`, `machine`, and
     ``started`` (ISO 8601, UTC), ``command`` (passwords hidden), ``cwd``, ``pid``, ``python``.
     """
     return {
@@ -77,28 +77,28 @@ def provenance() -> dict[str, Any]:
 
 
 def commit_of(process: Mapping[str, Any]) -> str:
-    """Git commit of a process, with "+" for uncommitted changes; "" where there is none."""
+    """Return the commit of a process, with "+" for uncommitted changes; "": there is none."""
     commit = process.get("git_commit")
     return f"{commit[:COMMIT_LENGTH]}{'+' if process.get('git_dirty') else ''}" if commit else ""
 
 
 @cache
 def code() -> dict[str, Any]:
-    """The code of this package as this process first saw it: `checkout_of`, `package_digest`."""
+    """Record this package's code as this process first saw it: `checkout_of`, `package_digest`."""
     return {**checkout_of(Path(__file__).resolve()), "code": package_digest(PACKAGE)}
 
 
 def package_digest(package: Path) -> str:
-    """SHA-256 in hexadecimal over the names and contents of a package's code and tables."""
+    """Return the SHA-256 of names and contents of a package's code and tables, in hexadecimal."""
     digest = hashlib.sha256()
-    for path in sorted(each for each in package.rglob("*") if each.suffix in (".py", ".csv")):
+    for path in sorted(file for file in package.rglob("*") if file.suffix in (".py", ".csv")):
         content = path.read_bytes()
         digest.update(f"{path.relative_to(package)} {len(content)}\n".encode() + content)
     return digest.hexdigest()
 
 
 def checkout_of(file: Path) -> dict[str, Any]:
-    """Commit (None: not under git) and uncommitted changes of the checkout that tracks `file`."""
+    """Read commit (None: not under git) and uncommitted changes of the checkout of `file`."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(file.parent), *arguments]
@@ -123,16 +123,16 @@ def checkout_of(file: Path) -> dict[str, Any]:
 def packages() -> dict[str, str]:
     """Name -> version of the installed distributions as this process first saw them."""
     found = {}
-    for each in metadata.distributions():
+    for distribution in metadata.distributions():
         # The first lines of the metadata: parsing all of them takes ten times as long.
-        text = each.read_text("METADATA") or each.read_text("PKG-INFO") or ""
+        text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
         fields = dict(line.partition(": ")[::2] for line in text.split("\n\n", 1)[0].splitlines())
         found[fields.get("Name", "").strip()] = fields.get("Version", "").strip()
     return {name: found[name] for name in sorted(found, key=str.lower) if name}
 
 
 def machine() -> dict[str, Any]:
-    """The machine: processor, cores, memory, graphics cards, threads of torch."""
+    """Return the machine: processor, cores, memory, graphics cards, threads of torch."""
     # Imported here, so that reading provenance does not cost the start of torch.
     import torch
 
@@ -154,12 +154,12 @@ def machine() -> dict[str, Any]:
 
 
 def machine_name(entry: Mapping[str, Any]) -> str:
-    """The graphics card of a `machine` or of an entry of provenance, else its processor, or ""."""
+    """Name the graphics card of a `machine` or entry of provenance, else its processor, or ""."""
     return str((entry.get("gpus") or [entry.get("cpu") or ""])[0])
 
 
 def other_code(folder: Path) -> str | None:
-    """Such as "commit abc1234567 of 2026-11-20, now def5678901+", where a run has other code.
+    """Say "commit abc1234567 of 2026-11-20, now def5678901+" where a run has other code.
 
     Compared is the digest of the package's source, so that changed documents and tests are no
     other code. What a process did after the step at which a later one began does not count.

@@ -41,12 +41,12 @@ OWN = "counts_test.npz"
 
 @lru_cache(maxsize=10_000)
 def _measurement(path: Path, _changed: int, _size: int) -> Measurement:
-    """What a file is of; tables ask again and again."""
+    """Return what a file is of; tables ask again and again."""
     return read_measurement(path)
 
 
 def _check_step(step: int, best: int) -> None:
-    """InputError: the checkpoint was another one when this was measured."""
+    """Refuse counts of another checkpoint than the best one of today (InputError)."""
     if step != best:
         raise InputError(f"it is of step {step}, but the best is of step {best}; measure it again.")
 
@@ -136,7 +136,7 @@ class RunResult:
         return other_code(self.folder)
 
     def recorded_scores(self) -> dict[str, float]:
-        """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
+        """Return scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
         result = self.result
         return {
             f"{split}/{name}": in_percent(name, value)
@@ -146,7 +146,7 @@ class RunResult:
         }
 
     def counts(self, split: str = "test") -> Counts:
-        """The stored confusion counts of a split, per image and region.
+        """Return the stored confusion counts of a split, per image and region.
 
         Args:
             split: "test" and the split that chose the checkpoint (usually "val") are always there;
@@ -159,7 +159,7 @@ class RunResult:
         path = self.folder / (split if split.endswith(".npz") else counts_name(split))
         if path.is_file() or split.endswith(".npz"):
             counts = Counts.load(path)
-            self._check_fits(counts, path)
+            _check_fits(self, counts, path)
             return self._scored(counts, path)
         how = "rerun the command of the run to finish it"
         if self.is_finished:
@@ -167,7 +167,7 @@ class RunResult:
         raise InputError(f"{self.folder} has no counts of the split '{split}'; {how}.")
 
     def measurements(self) -> dict[str, Measurement]:
-        """Files of counts inside the folder, and what they are of.
+        """Return the files of counts inside the folder, and what they are of.
 
         A damaged one, or one of an earlier step than that of the finished run, is left out with a
         warning.
@@ -185,7 +185,7 @@ class RunResult:
         return found
 
     def _scored(self, counts: Counts, path: Path) -> Counts:
-        """The counts with the scored classes and the rule for absent ones of the run's own test."""
+        """Give counts the scored classes and the rule for absent ones of the run's own test."""
         own = self.folder / OWN
         if path == own or not own.is_file():
             return counts
@@ -195,78 +195,80 @@ class RunResult:
         measurement = replace(counts.measurement, absent=first.absent)
         return replace(counts, unscored=first.unscored, measurement=measurement)
 
-    def _check_fits(self, counts: Counts, path: Path) -> None:
-        """InputError: counts of another run, or not of the labels that its own counts are of."""
-        advice = "restore the file of this run, or give its folder the name of the run"
-        run, key = counts.measurement.run, run_key(self.folder)
-        if run not in ("", key) and not self.run_id:
-            raise InputError(f"{path} has counts of the run {run}, not of {key}; {advice}.")
-        if protocol_of(counts.partition) and counts.counts.shape[1] % (len(counts.classes) + 1):
-            raise InputError(f"{path} has other rows than {counts.partition}; {advice}.")
-        result = read_result(self.folder)
-        if result is None or counts.dataset != result.get("dataset"):
-            # A selection may have been made before files of the data set changed.
-            if result is not None and path.parent == self.folder and counts.split == "test":
-                raise InputError(f"{path} has counts of other images than the run; {advice}.")
-            return
-        first = self.folder / counts_name(counts.split)
-        if path == first or not first.is_file() or protocol_of(counts.partition):
-            return
-        own = Counts.load(first)
-        # Unreadable images may have been skipped, once or both times.
-        known = set(own.names)
-        names = [name for name in counts.names if name in known]
-        is_part = len(names) in (len(own.names), len(counts.names))
-        if not is_part or own.classes != counts.classes:
-            raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")
-        mine, others = (each.select(names).labelled() for each in (own, counts))
-        # Labels that are counted at another size have other numbers of pixels.
-        is_alike = own.partition == counts.partition
-        is_alike = is_alike and np.array_equal(mine.sum((1, 2)), others.sum((1, 2)))
-        if is_alike and not np.array_equal(mine, others):
-            raise InputError(f"{path} has counts of other labels than {first.name}; {advice}.")
 
-    def check(self) -> None:
-        """Compare the stored scores with those of the stored counts, and these with the settings.
+def _check_fits(stored: RunResult, counts: Counts, path: Path) -> None:
+    """Refuse counts of another run or of other labels than its own counts (InputError)."""
+    advice = "restore the file of this run, or give its folder the name of the run"
+    run, key = counts.measurement.run, run_key(stored.folder)
+    if run not in ("", key) and not stored.run_id:
+        raise InputError(f"{path} has counts of the run {run}, not of {key}; {advice}.")
+    if protocol_of(counts.partition) and counts.counts.shape[1] % (len(counts.classes) + 1):
+        raise InputError(f"{path} has other rows than {counts.partition}; {advice}.")
+    result = read_result(stored.folder)
+    if result is None or counts.dataset != result.get("dataset"):
+        # A selection may have been made before files of the data set changed.
+        if result is not None and path.parent == stored.folder and counts.split == "test":
+            raise InputError(f"{path} has counts of other images than the run; {advice}.")
+        return
+    first = stored.folder / counts_name(counts.split)
+    if path == first or not first.is_file() or protocol_of(counts.partition):
+        return
+    own = Counts.load(first)
+    # Unreadable images may have been skipped, once or both times.
+    known = set(own.names)
+    names = [name for name in counts.names if name in known]
+    is_part = len(names) in (len(own.names), len(counts.names))
+    if not is_part or own.classes != counts.classes:
+        raise InputError(f"{path} has counts of other images than {first.name}; {advice}.")
+    mine, others = own.select(names).labelled(), counts.select(names).labelled()
+    # Labels that are counted at another size have other numbers of pixels.
+    is_alike = own.partition == counts.partition
+    is_alike = is_alike and np.array_equal(mine.sum((1, 2)), others.sum((1, 2)))
+    if is_alike and not np.array_equal(mine, others):
+        raise InputError(f"{path} has counts of other labels than {first.name}; {advice}.")
 
-        InputError: a score differs or is missing, or a file is damaged. A score whose counts the
-        folder does not hold cannot be compared.
-        """
-        for pattern in COUNTS:
-            for path in self.folder.glob(pattern):
-                self.counts(path.relative_to(self.folder).as_posix())
-        metric = {
-            key: each for key, each in self.settings.get("metric", {}).items() if key != "_target_"
-        }
-        own, given = self.counts(), self.result.get("test", {})
-        if metric.keys() == Regions.__annotations__.keys():  # not of a user's own class
-            wanted = Regions(**metric)
-            if (own.partition, own.absent) != (wanted.name, wanted.absent):
-                said = f"{own.partition} ({own.absent}), not of {wanted.name} ({wanted.absent})"
-                raise InputError(f"{self.folder} has counts of {said}; {ADVICE}.")
-        scores = {name: [score] for name, score in summary(own, own.absent).items()}
-        for name, score in self._further_scores():
-            if name in given:
-                scores.setdefault(name, []).append(score)
-        for name, found in scores.items():
-            stored = math.nan if given.get(name) is None else given[name]
-            if not np.isclose(found, stored, rtol=0, atol=1e-9, equal_nan=True).any():
-                raise InputError(
-                    f"{self.folder / 'result.json'} has {name} {stored}, but its counts give "
-                    f"{found[0]}; {ADVICE}."
-                )
 
-    def _further_scores(self) -> Iterator[tuple[str, float]]:
-        """Scores of other views, heads and pairs of frames, by their names in ``result.json``."""
-        for path, of in self.measurements().items():
-            if of.split != "test" or len(of.changed) != 1:
-                continue
-            counts = self.counts(path)
-            if (protocol := protocol_of(of.partition)) is not None:
-                for name in HEADLINES[protocol][:2]:
-                    key = consistency(CA if name == CA_RELEASED else name, protocol)
-                    yield key, value(name, counts, counts.absent) / 100
-            elif of.changed[0] in ("view", "head"):
-                part = of.view if of.changed[0] == "view" else f"{of.head}_head"
-                for name, score in summary(counts, counts.absent).items():
-                    yield subset(part, name), score
+def check_result(run: RunResult) -> None:
+    """Compare the stored scores with those of the stored counts, and these with the settings.
+
+    InputError: a score differs or is missing, or a file is damaged. A score whose counts the
+    folder does not hold cannot be compared.
+    """
+    for pattern in COUNTS:
+        for path in run.folder.glob(pattern):
+            run.counts(path.relative_to(run.folder).as_posix())
+    metric = dict(run.settings.get("metric", {}))
+    metric.pop("_target_", None)
+    own, given = run.counts(), run.result.get("test", {})
+    if metric.keys() == Regions.__annotations__.keys():  # not of a user's own class
+        wanted = Regions(**metric)
+        if (own.partition, own.absent) != (wanted.name, wanted.absent):
+            said = f"{own.partition} ({own.absent}), not of {wanted.name} ({wanted.absent})"
+            raise InputError(f"{run.folder} has counts of {said}; {ADVICE}.")
+    scores = {name: [score] for name, score in summary(own, own.absent).items()}
+    for name, score in _further_scores(run):
+        if name in given:
+            scores.setdefault(name, []).append(score)
+    for name, found in scores.items():
+        stored = math.nan if given.get(name) is None else given[name]
+        if not np.isclose(found, stored, rtol=0, atol=1e-9, equal_nan=True).any():
+            raise InputError(
+                f"{run.folder / 'result.json'} has {name} {stored}, but its counts give "
+                f"{found[0]}; {ADVICE}."
+            )
+
+
+def _further_scores(run: RunResult) -> Iterator[tuple[str, float]]:
+    """Yield scores of other views, heads and pairs by their names in ``result.json``."""
+    for path, of in run.measurements().items():
+        if of.split != "test" or len(of.changed) != 1:
+            continue
+        counts = run.counts(path)
+        if (protocol := protocol_of(of.partition)) is not None:
+            for name in HEADLINES[protocol][:2]:
+                key = consistency(CA if name == CA_RELEASED else name, protocol)
+                yield key, value(name, counts, counts.absent) / 100
+        elif of.changed[0] in ("view", "head"):
+            part = of.view if of.changed[0] == "view" else f"{of.head}_head"
+            for name, score in summary(counts, counts.absent).items():
+                yield subset(part, name), score

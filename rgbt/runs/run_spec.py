@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
-
-from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, checked_nodes, objects
@@ -44,7 +42,7 @@ T = TypeVar("T")
 
 
 def labels_key(domain: str) -> str:
-    """The setting that names the labels of a domain."""
+    """Return the setting that names the labels of a domain."""
     return f"domains.{domain}.labels"
 
 
@@ -116,15 +114,15 @@ class SourceSeeds(NamedTuple):
     masks: int
 
 
-class Values(TypedDict):
-    """Every plain value at the top of the configuration."""
-
-    name: Text
-    seed: Seed
-    runs_dir: Text
-    fresh: bool
-    pretrained: Text | None
-    out: Text | None
+# Types of the plain values at the top of the configuration.
+VALUES: dict[str, Any] = {
+    "name": Text,
+    "seed": Seed,
+    "runs_dir": Text,
+    "fresh": bool,
+    "pretrained": Text | None,
+    "out": Text | None,
+}
 
 
 @dataclass(frozen=True)
@@ -205,11 +203,12 @@ class RunSpec:
         return int(self.plain["seed"])
 
     def check(self) -> RunSpec:
-        """This specification, after all settings were checked; InputError names a wrong one."""
-        check_value("", {key: self.plain[key] for key in Values.__annotations__}, Values)
+        """Check all settings, here and upstream, and return this; InputError names a wrong one."""
+        for key, kind in VALUES.items():
+            check_value(key, self.plain[key], kind)
         self.use([name for name in NODES if name not in vars(self)])
-        for each in self.dependencies:
-            each.run.check()
+        for run in self.upstream:
+            run.check()
         return self
 
     def use(self, names: Iterable[str]) -> None:
@@ -218,7 +217,7 @@ class RunSpec:
         vars(self).update(found)
 
     def build(self, *names: str, **collaborators: Any) -> dict[str, Any]:
-        """Attributes by name; of components the objects, with those collaborators they take."""
+        """Return attributes by name; of components objects, with those collaborators they take."""
         return objects({name: getattr(self, name) for name in names}, collaborators)
 
     @cached_property
@@ -234,11 +233,7 @@ class RunSpec:
         Raises:
             InputError: the file of weights, the folder of pseudo-labels or the checkout is missing.
         """
-        settings = {
-            name: {k: v for k, v in self.plain[name].items() if k not in node.outside_key}
-            for name, node in NODES.items()
-            if node.in_key
-        }
+        settings = _settings_in_key(self.plain)
         model, domains = settings["model"], settings["domains"]
         if self.weights is not None:
             model["weights"] = self._content(WEIGHTS, self.weights)
@@ -254,22 +249,17 @@ class RunSpec:
                     f"model.constructor={model['constructor']} in model.root={model['root']}."
                 )
             model["checkout"] = dict(found)
-        text = json.dumps(
-            _plain_numbers({**settings, "seeds": self.drawn, "code": code}), sort_keys=True
-        )
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        return _digest({**settings, "seeds": self.drawn, "code": code})
 
     def is_run(self, run: RunResult) -> bool:
-        """Whether a stored run is this one: by its key, or without the checkout by its settings."""
-        if self._has_code:
+        """Say whether a stored run is this one: by its key, or without a checkout by settings.
+
+        An external network has no key where its checkout is not here.
+        """
+        model = self.plain["model"]
+        if model.get("_target_") != EXTERNAL or checkout_code(model):
             return self.key == run.key
         return settings_digest(self.plain) == settings_digest(run.settings)
-
-    @cached_property
-    def _has_code(self) -> bool:
-        """Whether the checkout of an external network is here, without which it has no key."""
-        model = self.plain["model"]
-        return model.get("_target_") != EXTERNAL or bool(checkout_code(model))
 
     @property
     def names_files(self) -> bool:
@@ -277,22 +267,22 @@ class RunSpec:
 
         Such a stored run is compared by its settings: a stranger's files are not opened.
         """
+        if self.plain["model"].get("_target_") == EXTERNAL:
+            return True
         named = {WEIGHTS: self.weights}
         for name in ("source", "target"):
             domain = self.plain["domains"][name] or {}
             named[labels_key(name)] = domain.get("labels")
-        is_named = any(
-            value not in (None, GIVEN, NONE) and self.dependency(key) is None
-            for key, value in named.items()
-        )
-        is_external = self.plain["model"].get("_target_") == EXTERNAL
-        return is_external or is_named or any(run.names_files for run in self.upstream)
+        for key, value in named.items():
+            if value not in (None, GIVEN, NONE) and self.dependency(key) is None:
+                return True
+        return any(run.names_files for run in self.upstream)
 
     @property
     def drawn(self) -> SourceSeeds:
         """The seed of every source of random draws."""
         own = (self.seeds.weights, self.seeds.order, self.seeds.masks)
-        return SourceSeeds(*(self.seed if each is None else each for each in own))
+        return SourceSeeds(*(self.seed if seed is None else seed for seed in own))
 
     @property
     def folder(self) -> Path:
@@ -315,27 +305,25 @@ class RunSpec:
         order: dict[str, RunSpec] = {}
         for spec in self.upstream:
             if not spec.is_finished:
-                order |= {each.key: each for each in spec.pending}
+                order |= {run.key: run for run in spec.pending}
         return (*order.values(), self)
 
     @property
     def upstream(self) -> tuple[RunSpec, ...]:
         """The runs that this one depends on."""
-        return tuple(each.run for each in self.dependencies)
+        return tuple(dependency.run for dependency in self.dependencies)
 
     def dependency(self, key: str) -> Dependency | None:
-        """The upstream run that the setting `key` names; None where it names none."""
-        return next((each for each in self.dependencies if each.key == key), None)
+        """Return the upstream run that the setting `key` names; None where it names none."""
+        for dependency in self.dependencies:
+            if dependency.key == key:
+                return dependency
+        return None
 
     @property
     def weights(self) -> str | None:
         """`model.weights`: a file, a run folder, or "experiment:NAME/best.pt"."""
         return cast("str | None", self.plain["model"].get("weights"))
-
-    @property
-    def fresh_parts(self) -> tuple[str, ...]:
-        """`model.fresh`: beginnings of parameter names that keep their random start."""
-        return tuple(self.plain["model"].get("fresh") or ())
 
     @property
     def weights_path(self) -> Path | None:
@@ -364,7 +352,7 @@ class RunSpec:
         return missing
 
     def labels_folder(self, domain: str) -> Path | None:
-        """The folder of pseudo-labels of "source" or "target"; None where it takes none."""
+        """Return the folder of pseudo-labels of "source" or "target"; None where it takes none."""
         settings = self.domains.named[domain]
         dependency = self.dependency(labels_key(domain))
         if dependency is not None:
@@ -378,21 +366,18 @@ class RunSpec:
     @property
     def uses_pretrained(self) -> bool:
         """Whether this run, or one upstream of it, starts from the file `pretrained`."""
-        return self.weights == self.plain["pretrained"] or any(
-            each.run.uses_pretrained for each in self.dependencies
-        )
+        is_here = self.weights == self.plain["pretrained"]
+        return is_here or any(run.uses_pretrained for run in self.upstream)
 
     def with_seed(self, seed: int) -> RunSpec:
-        """The same run with another seed; so its upstream runs, but for a common start of all."""
+        """Return the run with another seed, and so its upstream runs but a common start of all."""
         words = [word for word in self.overrides if not word.startswith("seed=")]
         further = seed - self.seed if self.seeds.start == "run" else 0
-
-        def seed_of(each: Dependency) -> int:
-            return each.run.seed + further if each.is_common else seed
-
-        upstream = (
-            replace(each, run=each.run.with_seed(seed_of(each))) for each in self.dependencies
-        )
+        upstream = []
+        for dependency in self.dependencies:
+            run = dependency.run
+            changed = run.with_seed(run.seed + further if dependency.is_common else seed)
+            upstream.append(replace(dependency, run=changed))
         return replace(
             self,
             overrides=(*words, f"seed={seed}"),
@@ -401,11 +386,11 @@ class RunSpec:
         )
 
     def own_code(self) -> dict[str, str]:
-        """Digest or version of all code in the run that is not ours, by module (see `code_of`)."""
+        """Return the digest or version of all code in the run that is not ours (see `code_of`)."""
         return code_of(self.plain)
 
     def _content(self, key: str, value: str) -> str:
-        """The digest or key that represents a file, a folder or an upstream run in the key."""
+        """Return what represents a file, a folder or an upstream run in the key: digest or key."""
         dependency = self.dependency(key)
         if dependency is not None:
             return f"{dependency.run.key}/{dependency.checkpoint}"
@@ -426,38 +411,47 @@ class RunSpec:
 
 
 def settings_digest(plain: Mapping[str, Any]) -> str:
-    """12 hexadecimal digits of the settings in the run key as they are written, without content.
+    """Return 12 hexadecimal digits of the settings in the run key as written, without content.
 
     A checkpoint holds them, so that a ``config.yaml`` that was changed since is noticed without the
     files and upstream runs that the key depends on. Runs of a checkout that is not here are told by
     them.
     """
-    places = {"model": ("weights", "checkout"), "domains": ("source", "target")}
-    settings = {
-        name: {
-            k: v
-            for k, v in plain.get(name, {}).items()
-            if k not in (*node.outside_key, *places.get(name, ()))
-        }
-        for name, node in NODES.items()
-        if node.in_key
-    }
-    text = json.dumps(_plain_numbers({**settings, "seed": plain.get("seed")}), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    settings = _settings_in_key(plain)
+    for path in ("model.weights", "model.checkout", "domains.source", "domains.target"):
+        node, _, key = path.partition(".")
+        settings[node].pop(key, None)
+    return _digest({**settings, "seed": plain.get("seed")})
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _settings_in_key(plain: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Copy the nodes in the key, without their settings that are not."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, node in NODES.items():
+        if node.in_key:
+            found[name] = dict(plain.get(name, {}))
+            for key in node.outside_key:
+                found[name].pop(key, None)
+    return found
+
+
+def _digest(settings: Mapping[str, Any]) -> str:
+    text = json.dumps(_plain_numbers(settings), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
 def _plain_numbers(value: Any) -> Any:
-    """`value` with 4 for 4.0, which are one setting."""
+    """Return `value` with 4 for 4.0, which are one setting."""
     if isinstance(value, Mapping):
-        return {str(key): _plain_numbers(each) for key, each in value.items()}
+        return {str(key): _plain_numbers(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain_numbers(each) for each in value]
+        return [_plain_numbers(inner) for inner in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -466,44 +460,20 @@ NODES: dict[str, Node[Any]] = {
     name: node for name, node in vars(RunSpec).items() if isinstance(node, Node)
 }
 
+
+def _outside_key() -> Iterator[str]:
+    yield from ("name", "runs_dir", "out")
+    for name, node in NODES.items():
+        if not node.in_key:
+            yield name
+        for key in node.outside_key:
+            yield f"{name}.{key}"
+
+
 # Dotted keys in which two configurations of one run may differ.
-NOT_IN_KEY = (
-    "name",
-    "runs_dir",
-    "out",
-    *(key for key, node in NODES.items() if not node.in_key),
-    *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
-)
+NOT_IN_KEY = tuple(_outside_key())
 
 
 def is_in_key(key: str) -> bool:
-    """Whether the setting with a dotted key is part of the run key."""
+    """Say whether the setting with a dotted key is part of the run key."""
     return not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
-
-
-# Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
-# the scale. A duration is that of the scale unless it was typed.
-SHARED = (
-    "seed",
-    "runs_dir",
-    "pretrained",
-    *(key for key, node in NODES.items() if node.shared is True),
-    *(
-        f"{key}.{each}"
-        for key, node in NODES.items()
-        if not isinstance(node.shared, bool)
-        for each in node.shared
-    ),
-)
-
-# Dotted keys that a common upstream run takes over from the run that needs it first. None of them
-# enters the run key, so that it is one run for all seeds and data sets.
-SHARED_BY_COMMON = (
-    *(key for key in SHARED if key in NOT_IN_KEY),
-    *(
-        f"{key}.{each}"
-        for key, node in NODES.items()
-        if node.shared is True and key != "dataset"
-        for each in node.outside_key
-    ),
-)

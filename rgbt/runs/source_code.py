@@ -56,7 +56,7 @@ def user_code(named: Iterable[str]) -> tuple[Used, ...]:
         per process, so that the answer belongs to the code that this process has loaded.
     """
     own = set()
-    for target in (each for each in named if each.split(".")[0] not in RELEASED):
+    for target in (name for name in named if name.split(".")[0] not in RELEASED):
         name = target.rpartition(".")[0]
         while "." in name and _place(name) is None:  # the longest beginning that is a module
             name = name.rpartition(".")[0]
@@ -72,7 +72,7 @@ def user_code(named: Iterable[str]) -> tuple[Used, ...]:
 
 
 def checkout_code(model: Mapping[str, Any]) -> tuple[Used, ...]:
-    """Modules of the checkout that a network executes, with the digest of their code, by name.
+    """List the modules of a checkout that a network executes, with the digest of their code.
 
     An adapter of the recipe is one of them, and what it imports is followed.
 
@@ -94,7 +94,7 @@ def checkout_code(model: Mapping[str, Any]) -> tuple[Used, ...]:
     def file_of(name: str) -> Path | None:
         place = root.joinpath(*name.split("."))
         files = (place / "__init__.py", place.with_name(f"{place.name}.py"))
-        found = next((each for each in files if each.is_file()), None)
+        found = next((file for file in files if file.is_file()), None)
         return adapter if name == ADAPTER else found
 
     first = constructor.partition(":")[0] if adapter is None else ADAPTER
@@ -103,7 +103,7 @@ def checkout_code(model: Mapping[str, Any]) -> tuple[Used, ...]:
 
 
 def code_of(plain: Mapping[str, Any]) -> dict[str, str]:
-    """The user's own code and that of a checkout in a configuration: digest by module.
+    """Return the user's own code and that of a checkout in a configuration: digest by module.
 
     Args:
         plain: the whole configuration as resolved values.
@@ -112,19 +112,19 @@ def code_of(plain: Mapping[str, Any]) -> dict[str, str]:
 
 
 def counted_modules() -> list[str]:
-    """Modules of the user's own tree that `user_code` has read and this process has imported."""
+    """List the user's own modules that `user_code` has read and this process has imported."""
     names = {name for used in _used_by.values() for name, _ in used}
     return sorted(name for name in names & set(sys.modules) if name != "__main__")
 
 
 def loaded_modules() -> list[str]:
-    """Modules of the user's own tree that this process has imported."""
+    """Return the modules of the user's own tree that this process has imported."""
     files = [(name, getattr(module, "__file__", None)) for name, module in sys.modules.items()]
     return [name for name, file in files if name.split(".")[0] not in SHIPPED and _is_own(file)]
 
 
 def _modules_from(module: str, file_of: Callable[[str], Path | None]) -> Iterator[Used]:
-    """A module and everything that it imports, as far as `file_of` gives files, with digests."""
+    """Yield a module and all that it imports, as far as `file_of` gives files, with digests."""
     waiting, seen = [*_with_packages(module)], set()
     while waiting:
         name = waiting.pop()
@@ -138,13 +138,13 @@ def _modules_from(module: str, file_of: Callable[[str], Path | None]) -> Iterato
 
 
 def _own_file(name: str) -> Path | None:
-    """The file of a module of the user's own tree; None for all others."""
+    """Return the file of a module of the user's own tree; None for all others."""
     place = None if name.split(".")[0] in RELEASED else _place(name)
     return Path(str(place[0])) if place is not None and _is_own(place[0]) else None
 
 
 def _place(name: str) -> tuple[str | None, Any] | None:
-    """File of a module and where its submodules lie; None where there is no such module."""
+    """Find the file of a module and where its submodules lie; None: there is no such module."""
     module = sys.modules.get(name)
     if module is not None:
         return getattr(module, "__file__", None), getattr(module, "__path__", None)
@@ -161,7 +161,7 @@ def _place(name: str) -> tuple[str | None, Any] | None:
 
 
 def _is_own(file: str | None) -> bool:
-    """Whether a file is neither of Python nor of an installed distribution."""
+    """Say whether a file is neither of Python nor of an installed distribution."""
     if file is None or INSTALLED & set(Path(file).parts) or not Path(file).is_file():
         return False
     library = (sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib"))
@@ -170,7 +170,7 @@ def _is_own(file: str | None) -> bool:
 
 @cache
 def _parsed(name: str, file: Path, _state: tuple[int, ...]) -> tuple[str, list[str]]:
-    """Digest of a module's code, and what it imports, for this state of the file."""
+    """Return the digest of a module's code, and what it imports, for this state of the file."""
     content = file.read_bytes()
     try:
         tree = ast.parse(content) if file.suffix == ".py" else None
@@ -183,12 +183,12 @@ def _parsed(name: str, file: Path, _state: tuple[int, ...]) -> tuple[str, list[s
 
 
 def _structure(node: Any) -> Any:
-    """A syntax tree without what does not run: comments, layout, docstrings, line numbers.
+    """Return a syntax tree without what does not run: comments, layout, docstrings, line numbers.
 
     Empty fields are left out, so that Python versions that add fields give the same.
     """
     if isinstance(node, list):
-        return [_structure(each) for each in node if not _is_docstring(each)]
+        return [_structure(part) for part in node if not _is_docstring(part)]
     if not isinstance(node, ast.AST):
         return node
     fields = [(name, value) for name, value in ast.iter_fields(node) if value not in (None, [])]
@@ -214,6 +214,6 @@ def _imports(tree: ast.AST, package: str) -> Iterator[str]:
 
 
 def _with_packages(name: str) -> Iterator[str]:
-    """A dotted name and all its beginnings: importing a module runs its packages first."""
+    """Return a dotted name and all its beginnings: importing a module runs its packages first."""
     parts = name.split(".")
     yield from (".".join(parts[: n + 1]) for n in range(len(parts)))

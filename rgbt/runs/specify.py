@@ -3,7 +3,7 @@
 A run names an upstream run by its experiment: ``model.weights=experiment:NAME/last.pt`` starts
 from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/best.pt`` trains on
 the predictions of its network. Both runs share seed, scale and data set
-(`rgbt.runs.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
+(`SHARED`): a run of seed 2 depends on runs of seed 2.
 
 ``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own data set: all methods
 with the same network start from the same run. It also keeps its own seed, unless `seeds.start` says
@@ -37,8 +37,7 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.ranges import Seed
 from rgbt.runs.run_spec import (
     NODES,
-    SHARED,
-    SHARED_BY_COMMON,
+    NOT_IN_KEY,
     WEIGHTS,
     CheckpointFile,
     Dependency,
@@ -75,8 +74,35 @@ CHANGEABLE = (
 )
 
 
+def _shared_keys() -> Iterator[str]:
+    yield from ("seed", "runs_dir", "pretrained")
+    for name, node in NODES.items():
+        if node.shared is True:
+            yield name
+    for name, node in NODES.items():
+        if not isinstance(node.shared, bool):
+            yield from (f"{name}.{key}" for key in node.shared)
+
+
+# Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
+# the scale. A duration is that of the scale unless it was typed.
+SHARED = tuple(_shared_keys())
+
+
+def _keys_shared_by_common() -> Iterator[str]:
+    yield from (key for key in SHARED if key in NOT_IN_KEY)
+    for name, node in NODES.items():
+        if node.shared is True and name != "dataset":
+            yield from (f"{name}.{key}" for key in node.outside_key)
+
+
+# Dotted keys that a common upstream run takes over from the run that needs it first. None of them
+# enters the run key, so that it is one run for all seeds and data sets.
+SHARED_BY_COMMON = tuple(_keys_shared_by_common())
+
+
 def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
-    """The checked specification of a run.
+    """Make and check the specification of a run.
 
     Args:
         config: as composed by Hydra.
@@ -90,7 +116,7 @@ def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
 
 
 def requested_run(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
-    """The same without checking the settings, so that no class of a component is imported.
+    """Make a specification without checking it, so that no class of a component is imported.
 
     Args:
         config: as composed by Hydra.
@@ -105,7 +131,7 @@ def requested_run(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
 def _requested(
     config: DictConfig, plain: dict[str, Any], overrides: Sequence[str], downstream: tuple[str, ...]
 ) -> RunSpec:
-    """A run of a configuration with its `plain` values; `downstream`: experiments that need it."""
+    """Make the run of a configuration with its `plain` values; `downstream` experiments need it."""
     upstream = tuple(_dependencies(config, overrides, (*downstream, config.name)))
     return _spec_of(plain, overrides, upstream)
 
@@ -126,7 +152,7 @@ def _spec_of(
 def _dependencies(
     config: DictConfig, overrides: Sequence[str], downstream: tuple[str, ...]
 ) -> Iterator[Dependency]:
-    """The upstream runs that a configuration names, each with those upstream of it."""
+    """Return the upstream runs that a configuration names, each with those upstream of it."""
     for key in (WEIGHTS, labels_key("source"), labels_key("target")):
         reference = parse_reference(key, OmegaConf.select(config, key))
         if reference is None:
@@ -157,7 +183,7 @@ class Reference(NamedTuple):
 
 
 def parse_reference(key: str, value: str | None) -> Reference | None:
-    """What "experiment:NAME/last.pt" or "common:NAME/last.pt" names; None for any other value.
+    """Parse "experiment:NAME/last.pt" or "common:NAME/last.pt"; None for any other value.
 
     Raises:
         InputError: the reference is not of this form, there is no such experiment, or the labels
@@ -182,7 +208,7 @@ def parse_reference(key: str, value: str | None) -> Reference | None:
 def upstream_config(
     config: DictConfig, key: str, reference: Reference
 ) -> tuple[DictConfig, dict[str, Any]]:
-    """The configuration and plain values of an upstream run: its experiment, with what both share.
+    """Return configuration and plain values of an upstream run: its experiment and what both share.
 
     Shared are `SHARED`, the sizes of the scale and durations that were typed; for weights also the
     network. A common run shares `SHARED_BY_COMMON` instead of `SHARED`. Everything else is the
@@ -190,12 +216,14 @@ def upstream_config(
     """
     # Its experiment says whether a network has pretrained weights, the scale says all else.
     always = SHARED_BY_COMMON if reference.is_common else SHARED
-    shared = [*always, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
+    shared = [*always, *(f"scale.{size}" for size in config.scale if size != "pretrained")]
     if key == WEIGHTS:
-        shared += [f"model.{each}" for each in config.model if each not in RUN_SETTINGS["model"]]
+        shared += [
+            f"model.{setting}" for setting in config.model if setting not in RUN_SETTINGS["model"]
+        ]
     if reference.is_common and CACHE in config.dataset:
         shared.append(f"dataset.{CACHE}")
-    values = {each: _as_written(config, each) for each in shared}
+    values = {path: _as_written(config, path) for path in shared}
     content = pickle.dumps(values)
     return _upstream_config(reference, config.scale.name, content, key == WEIGHTS, own_folders())
 
@@ -215,18 +243,18 @@ def _upstream_config(
     upstream = compose([f"+experiment={reference.experiment}", f"scale={scale}"])
     if with_network:
         own_settings = RUN_SETTINGS["model"]
-        upstream.model = {each: upstream.model._get_node(each) for each in own_settings}
-    for each, value in pickle.loads(values).items():  # noqa: S301 - made above
-        if each != f"dataset.{CACHE}" or CACHE in upstream.dataset:
-            OmegaConf.update(upstream, each, value, merge=False, force_add=True)
+        upstream.model = {setting: upstream.model._get_node(setting) for setting in own_settings}
+    for key, value in pickle.loads(values).items():  # noqa: S301 - made above
+        if key != f"dataset.{CACHE}" or CACHE in upstream.dataset:
+            OmegaConf.update(upstream, key, value, merge=False, force_add=True)
     return upstream, resolved(upstream)
 
 
 def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
-    """The typed overrides that the upstream run of the setting `key` shares."""
+    """Return the typed overrides that the upstream run of the setting `key` shares."""
     always = SHARED_BY_COMMON if reference.is_common else SHARED
     # A file of conf/debug sets sizes of the scale.
-    groups = {"scale", "debug", *(each for each in always if each in NODES)}
+    groups = {"scale", "debug", *(node for node in always if node in NODES)}
     groups |= {"model"} if key == WEIGHTS else set()
     own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
     found = []
@@ -239,7 +267,7 @@ def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) 
 
 
 def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
-    """The run that today's files request by the command of a stored run; none of its words acts.
+    """Make the run that today's files request by a stored run's command; none of its words acts.
 
     A word that chooses a file is composed if a file of ours, or of the user, has that name. A word
     that sets a value only names it: the value is that of the stored settings. Others do nothing.
@@ -281,7 +309,7 @@ def request_again(settings: Mapping[str, Any], words: Sequence[str]) -> RunSpec:
 
 
 def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:
-    """The specification of a stored run; its weights and upstream runs are left out.
+    """Return the specification of a stored run; its weights and upstream runs are left out.
 
     Folders of caches, in which files are written, are those of the user or of `overrides`.
 
@@ -303,7 +331,7 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
 
 
 def _without_caches(node: Any, typed: set[str]) -> Any:
-    """A copy of a stored node, in which our classes get no folder to write into.
+    """Return a copy of a stored node, in which our classes get no folder to write into.
 
     What replaces it is not reported where it was `typed`.
     """
@@ -334,7 +362,7 @@ def _override(config: DictConfig, overrides: Sequence[str]) -> None:
     # camera@consistency.view.camera works there. The search path holds for the whole command.
     changes = [(k, v, k.rpartition("@")[2]) for k, v in pairs if k != SEARCH_PATH]
     for key, _, path in changes:
-        if not any(path == each or path.startswith(f"{each}.") for each in CHANGEABLE):
+        if not any(path == setting or path.startswith(f"{setting}.") for setting in CHANGEABLE):
             raise InputError(
                 f"'{key}' of a finished run cannot be changed; {nearest(key, CHANGEABLE)}."
             )
@@ -350,8 +378,8 @@ def _override(config: DictConfig, overrides: Sequence[str]) -> None:
         if path.split(".")[0] in groups:
             continue
         # A mapping such as dataset.shares is one value, and may be replaced as one.
-        if key not in known and not any(each.startswith(f"{key}.") for each in known):
-            near = [each for each in known if each.startswith(f"{key.partition('.')[0]}.")]
+        if key not in known and not any(other.startswith(f"{key}.") for other in known):
+            near = [other for other in known if other.startswith(f"{key.partition('.')[0]}.")]
             raise InputError(f"'{key}' is not a key of this run; {nearest(key, near)}.")
         OmegaConf.update(config, key, parse_yaml(value, key))
     is_typed = "metric.absent" in [path for _, _, path in changes]

@@ -15,7 +15,7 @@ from rgbt.losses.unlabelled import VERDICT_LOSSES, Judged
 from rgbt.losses.unlabelled import judged as judged_map
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import Record, Requirement, SchemeRecord, record_of
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
@@ -77,7 +77,7 @@ class Adversarial:
         self.cost_of = VERDICT_LOSSES[self.verdict_loss]
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """Labels of the target where they are read, confidence where it weighs."""
         labels = self.supervise_target
         setting = f"scheme.supervise_target={str(labels).lower()}"
@@ -85,7 +85,7 @@ class Adversarial:
         return self.passes.record_with(
             Requirement("domains", "target_labels", labels, setting),
             *((Requirement(*weighed),) if self.weighed_by_confidence else ()),
-            *record_of(self.others[CRITIC]).requires,
+            *record_of(self.others[CRITIC], Record).requires,
             networks=self.others,
             builders={CRITIC: self.critic_optimizer},
         )

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from rgbt.losses.distances import sdc, sdn
 from rgbt.ranges import NonNegative
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import MaskerRecord, Requirement, SchemeRecord, record_of
 from rgbt.schemes.domains import draw_masks
 from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
@@ -46,16 +46,16 @@ class CRM:
     nonlocal_weight: NonNegative
 
     def __post_init__(self) -> None:
-        self.hides_cells = record_of(self.masker).hides_cells
+        self.hides_cells = record_of(self.masker, MaskerRecord).hides_cells
         # Single-modality predictions cost two thirds of the head: only where they are read.
         self.views = VIEWS if self.modality_weight or self.nonlocal_weight else VIEWS[:1]
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """A network of all views in one pass; where something is distilled, a masked pass."""
         distilled = ("complementary_weight", "nonlocal_weight")
         weights = {name: getattr(self, name) for name in distilled}
-        return Record(
+        return SchemeRecord(
             requires=(
                 Requirement("model", "views", VIEWS),
                 Requirement("model", "stacks_passes", True),

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.processes import own, whole
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import Requirement, SchemeRecord
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase, View
 
 # The gradients with which the optimizers of two heads step their shared parameters.
@@ -84,10 +84,10 @@ class Passes:
 
     def record_with(
         self, *requires: Requirement, masked: Requirement = WHOLE_IMAGES, **provides: Any
-    ) -> Record:
+    ) -> SchemeRecord:
         """The record of a scheme of two domains and class scores; the masker must be `masked`."""
         heads = ("domains", "separate_heads", True, f"scheme.gradients={self.gradients}")
-        return Record(
+        return SchemeRecord(
             requires=(
                 Requirement("model", "outputs", "scores"),
                 masked,

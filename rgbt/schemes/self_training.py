@@ -20,7 +20,7 @@ from rgbt.losses.distances import FeatureDistance
 from rgbt.losses.unlabelled import WeightedBy, pseudo_labels
 from rgbt.processes import mean_count, own_draw
 from rgbt.ranges import NonNegative, Share
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import Requirement, SchemeRecord
 from rgbt.schemes.domains import Passes, SourceAndTarget, draw_masks, scores
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains, View
 
@@ -120,7 +120,7 @@ class SelfTraining:
             self.initial = copy.deepcopy(self.model).eval().requires_grad_(False)
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """No labels of the target, weighted pixels, and what is read of masks and features."""
         setting = f"scheme.masked_weight={self.masked_weight:g}"
         distance = self.feature_distance

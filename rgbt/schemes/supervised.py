@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from torch import nn
 
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import MaskerRecord, SchemeRecord, record_of
 from rgbt.schemes.domains import SourceAndTarget, draw_masks, options_of
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
@@ -21,12 +21,12 @@ class Supervised:
     loss: Loss
     masker: AnyMasker
     domains: SourceAndTarget
-    record: ClassVar[Record] = Record(shows_views=True)
+    record: ClassVar[SchemeRecord] = SchemeRecord(shows_views=True)
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of the loss."""
         masks = None
-        if record_of(self.masker).hides_cells:
+        if record_of(self.masker, MaskerRecord).hides_cells:
             masks = draw_masks(self.masker, batch, generator_of("mask"))
         options = options_of(self.domains.source)
         generator = generator_of("stochastic depth")

@@ -16,7 +16,14 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.processes import own_draw
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import (
+    LossRecord,
+    NetworkRecord,
+    Record,
+    Requirement,
+    SchemeRecord,
+    record_of,
+)
 from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
 
@@ -44,25 +51,25 @@ class Temporal:
     resolution: Literal["full", "half"] = "full"
 
     def __post_init__(self) -> None:
-        self.stacks = record_of(self.model).stacks_passes
-        self.reads_warped = record_of(self.loss).reads_warped
+        self.stacks = record_of(self.model, NetworkRecord).stacks_passes
+        self.reads_warped = record_of(self.loss, LossRecord).reads_warped
         self.apart = any(isinstance(module, _BatchNorm) for module in self.model.modules())
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """A loss of two frames, whole images, and class scores of both."""
-        makes_masks = record_of(self.model).outputs == "masks"
+        makes_masks = record_of(self.model, NetworkRecord).outputs == "masks"
         half = Requirement("loss", "compares_half", True, "scheme.resolution=half")
-        return Record(
+        return SchemeRecord(
             requires=(
                 Requirement("loss", "frames", 2),
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
                 *((half,) if self.resolution == "half" else ()),
-                *(each.inside("scheme") for each in record_of(self.view).requires),
+                *(each.inside("scheme") for each in record_of(self.view, Record).requires),
             ),
             frames=2,
-            camera=record_of(self.view).camera,
+            camera=self.view.camera,
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from rgbt.losses.unlabelled import guidance
 from rgbt.processes import mean_count, num_processes
 from rgbt.ranges import NonNegative, Share
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import Requirement, SchemeRecord
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import IGNORE, GeneratorOf, Loss, Phase, TwoDomains
 
@@ -33,7 +33,7 @@ class LabelledDomains:
         self.passes = Passes(**vars(self))
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """Labels of the target, beside what two domains require."""
         return self.passes.record_with(Requirement("domains", "target_labels", True))
 
@@ -66,7 +66,7 @@ class UnlabelledTarget:
         self.passes = Passes(self.model, self.loss, self.domains, "apart")
 
     @property
-    def record(self) -> Record:
+    def record(self) -> SchemeRecord:
         """No labels of the target; for guidance, an auxiliary head."""
         setting = f"scheme.guidance_weight={self.guidance_weight:g}"
         guided = (Requirement("model", "auxiliary", True, setting),) if self.guidance_weight else ()

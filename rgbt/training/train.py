@@ -34,9 +34,8 @@ from rgbt.evaluation.tables import result_tables
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.processes import agreed, alone
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 from rgbt.runs.folder import (
-    MarkerForm,
     MetricLine,
     RunFolder,
     counts_name,
@@ -199,7 +198,10 @@ class Training:
         """Name the settings of this run with which a step needs less memory."""
         session, sizes = self.setup.session, self.setup.sizes["trained"]
         size, precision = session.loading.batch_size, session.trainer.precision
-        network, crop_hw = record_of(session.model), record_of(session.transform).crop_hw
+        network, crop_hw = (
+            record_of(session.model, NetworkRecord),
+            record_of(session.transform, TransformRecord).crop_hw,
+        )
         advice = training_advice(session.trainer, size, network, crop_hw)
         what = f"a training step of {size} images of {sizes} in {precision}"
         return naming_memory(session.device, what, advice)
@@ -207,7 +209,7 @@ class Training:
     def _claim(self, fingerprint: str) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         root = self.setup.session.dataset.root
-        now: MarkerForm = {"names": names_key(self.setup.session), "files": fingerprint}
+        now = {"names": names_key(self.setup.session), "files": fingerprint}
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(

@@ -12,7 +12,7 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.ranges import GreyLevel, Lengths, Pixels, Rising, Share, Size
-from rgbt.requirements import Record
+from rgbt.requirements import TransformRecord
 from rgbt.transforms.maps import Maps, drawn_window, evaluated, short_edge_hw
 from rgbt.types import Example, Sample
 
@@ -62,9 +62,9 @@ class CrmTransform:
         return np.uint8 if self.colour == "intended" else np.float32
 
     @property
-    def record(self) -> Record:
+    def record(self) -> TransformRecord:
         """The size of its examples."""
-        return Record(crop_hw=self.crop_hw)
+        return TransformRecord(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example."""

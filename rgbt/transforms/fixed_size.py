@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.ranges import GreyLevel, Pixels, Rising, Share, Size
-from rgbt.requirements import Record
+from rgbt.requirements import TransformRecord
 from rgbt.transforms.crm import Factor
 from rgbt.transforms.maps import Maps, drawn_window, evaluated, mixed
 from rgbt.types import IGNORE, Example, Sample
@@ -35,9 +35,9 @@ class FixedSize:
     resizing: ClassVar[dict[str, Any]] = {}
 
     @property
-    def record(self) -> Record:
+    def record(self) -> TransformRecord:
         """The size of its examples."""
-        return Record(crop_hw=self.crop_hw)
+        return TransformRecord(crop_hw=self.crop_hw)
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
@@ -241,7 +241,7 @@ class HeatNetTransform:
 
     Images are float32. A block of RGB or of thermal becomes the grey level that the network
     normalises to 0, 127.5; thermal is scaled towards it. The release changes day images alone, so
-    the target domain gets neither (`Record.for_target`).
+    the target domain gets neither (`TransformRecord.for_target`).
 
     Source: HeatNet, Sec. IV.   Released: jzuern/heatnet-pub, training script and loader. There,
     blocks and thermal are decided for a batch, and in the segmentation's steps alone; here for
@@ -270,10 +270,10 @@ class HeatNetTransform:
             raise InputError("transform.drop_height, drop_width: blocks exceed transform.crop_hw.")
 
     @property
-    def record(self) -> Record:
+    def record(self) -> TransformRecord:
         """The size of its examples; images of the target keep their blocks and thermal."""
         plain = replace(self, drop_probability=0.0, thermal_probability=0.0, class_probability=0.0)
-        return Record(crop_hw=self.crop_hw, for_target=None if plain == self else plain)
+        return TransformRecord(crop_hw=self.crop_hw, for_target=None if plain == self else plain)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example of `crop_hw`; no label: all pixels ignored."""

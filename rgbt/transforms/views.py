@@ -75,10 +75,10 @@ class VirtualView:
 
     @property
     def record(self) -> Record:
-        """Its camera; class 0 is painted where nothing is seen, if that is the background."""
+        """Require that class 0, which is painted where nothing is seen, is the background."""
         painted = Requirement.of_background("view.outside=background")
         requires = () if self.outside == "ignore" else (painted,)
-        return Record(requires=requires, camera=self.camera)
+        return Record(requires=requires)
 
     def check(self, angles: Tensor, least: float = 0.0) -> None:
         """InputError where angles (B, 3) leave no more than a share of the camera's own images."""
@@ -182,7 +182,7 @@ class ViewSets:
     @property
     def record(self) -> Record:
         """What its views require of the data set."""
-        requires = record_of(self.view).requires if self.sets else ()
+        requires = record_of(self.view, Record).requires if self.sets else ()
         return Record(requires=tuple(each.inside("consistency") for each in requires))
 
     @cached_property

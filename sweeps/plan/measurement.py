@@ -7,10 +7,10 @@ from functools import cache
 from typing import Any, Literal, TypeAlias
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.config.corruption_node import choose_corruption
+from rgbt.config.overrides import composing
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import DEFAULTS, SCENE_KINDS, Details
 from rgbt.metrics.measurement import Measurement, dataset_words, settings_of

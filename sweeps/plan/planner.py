@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.compose import compose, with_pixels
+from rgbt.config.overrides import composing
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify

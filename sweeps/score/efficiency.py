@@ -7,9 +7,9 @@ from dataclasses import replace
 from functools import cache
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
+from rgbt.config.overrides import composing
 from sweeps.plan.request import TableRequest
 from sweeps.score.cells import NO_VALUE, CellId, TableCell
 

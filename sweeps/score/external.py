@@ -20,9 +20,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from analysis.uncertainty.contrasts import FIXED
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
+from rgbt.config.overrides import composing
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import read_measurement

@@ -16,7 +16,7 @@ from rgbt.assembly import contracts
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.maskers.masker import check_masker
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import LossRecord, NetworkRecord, record_of
 from rgbt.types import MaskPair, Output, Sample
 from tests.conftest import WriteMFNet
 from tests.data.layouts import refused
@@ -75,7 +75,7 @@ def drawn(found: Any) -> None:
 class Net(nn.Module):
     def __init__(self, found: Any, **record: Any) -> None:
         super().__init__()
-        self.found, self.record = found, Record(**record)
+        self.found, self.record = found, NetworkRecord(**record)
         contracts.watch_model(self, 5)
 
     def forward(self, rgb, thermal, masks=None, *, views=(), generator=None):
@@ -164,20 +164,21 @@ def test_network_is_examined_once_in_training_and_in_evaluation() -> None:
 
 def test_loss_passes_its_attributes_on() -> None:
     class Loss:
-        record = Record(weighs_confidence=True)
+        record = LossRecord(weighs_confidence=True)
 
         def __call__(self, output, batch, generator):
             return {"a": VALUE[None]}
 
     loss = contracts.CheckedLoss(Loss())
-    assert record_of(loss).weighs_confidence
-    assert record_of(contracts.CheckedLoss(lambda output, batch, generator: {})) == Record()
+    assert record_of(loss, LossRecord).weighs_confidence
+    checked = contracts.CheckedLoss(lambda output, batch, generator: {})
+    assert record_of(checked, LossRecord) == LossRecord()
     assert loss(None, None, None)["a"].shape == (1,)
 
 
 def test_loss_between_two_frames_is_called_with_both() -> None:
     class Loss:
-        record = Record(frames=2)
+        record = LossRecord(frames=2)
 
         def __init__(self, value: torch.Tensor) -> None:
             self.value = value

@@ -24,14 +24,14 @@ def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamesp
 def test_other_splits_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     warnings: list[str] = []
     monkeypatch.setattr(load_run, "warn", warnings.append)
-    before, other = (session(train=("a", each), test=("c",)) for each in "bc")
+    before, other = (session(train=("a", image), test=("c",)) for image in "bc")
     marker = tmp_path / "dataset.json"
     load_run._warn_of_other_splits(tmp_path, other)
     marker.write_text("{")
     load_run._warn_of_other_splits(tmp_path, other)
     write_json(marker, {"names": names_key(before), "files": "x"})
-    for each in (before, session(None, train=("a", "c"), test=("b",))):
-        load_run._warn_of_other_splits(tmp_path, each)
+    for opened in (before, session(None, train=("a", "c"), test=("b",))):
+        load_run._warn_of_other_splits(tmp_path, opened)
     assert warnings == [], "unknown, the same, a data set without name"
     load_run._warn_of_other_splits(tmp_path, other)
     (line,) = warnings

@@ -58,7 +58,7 @@ def composed(words: Callable[..., list[str]]) -> Composed:
 
 def test_probe_of_a_batch_of_one_leaves_no_trace(composed: Composed) -> None:
     model = set_up_training(composed("start_deeplabv2")).session.model
-    norms = [each for each in model.modules() if isinstance(each, torch.nn.BatchNorm2d)]
+    norms = [module for module in model.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     assert norms
     for norm in norms:
         assert norm.training
@@ -73,7 +73,7 @@ def test_class_weights_are_those_of_the_training_split(composed: Composed) -> No
     data = setup.session.dataset
     labels = [data.label(name) for name in data.names("train_day")]
     pixels = np.bincount(np.ravel(labels), minlength=256)[: data.num_classes]
-    expected = [pixels.sum() / len(pixels) / each if each else 0 for each in pixels]
+    expected = [pixels.sum() / len(pixels) / number if number else 0 for number in pixels]
     assert setup.scheme.loss.class_weights == pytest.approx(expected)  # type: ignore[attr-defined]
     inner = ["loss=cross_entropy_auxiliary", "model.auxiliary=true", "loss.loss.class_weights=enet"]
     nested = set_up_training(composed("start_deeplabv2", *inner)).scheme.loss.loss  # type: ignore[attr-defined]
@@ -102,8 +102,8 @@ def test_rare_classes_follow_the_labels_of_the_source(
         monkeypatch.setattr(module, name, instead)
     setup = set_up_training(composed("self_training_night", *words, "model.weights=null"))
     setup.batches(range(1))
-    assert [each[:2] for each in counted] == [(relabelled, setup.session.domains.source.split)]
-    assert [each[-1] for each in drawn] == ["rare", None]
+    assert [call[:2] for call in counted] == [(relabelled, setup.session.domains.source.split)]
+    assert [call[-1] for call in drawn] == ["rare", None]
 
 
 def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Path:

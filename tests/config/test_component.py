@@ -17,7 +17,7 @@ from rgbt.config.component import Component, build, setting_types
 from rgbt.config.compose import available, conf_dir
 from rgbt.config.values import check_value
 from rgbt.ranges import Pixels, Share
-from rgbt.runs.run_spec import NODES, Values
+from rgbt.runs.run_spec import NODES, VALUES
 from tests.models.golden import alone, compose
 
 
@@ -75,7 +75,7 @@ def test_node_is_built_with_converted_values_and_offered_objects() -> None:
 
 NAN, INFINITE = float("nan"), float("inf")
 WRONG: list[tuple[dict[str, Any], str]] = [
-    *(({"size": each}, "'knob.size[1]'") for each in ([1], [1, 2.5], [1, True], [1, "2"])),
+    *(({"size": size}, "'knob.size[1]'") for size in ([1], [1, 2.5], [1, True], [1, "2"])),
     ({"kind": "c"}, "'knob.kind'"),
     ({"share": 1.5}, "'knob.share'"),
     ({"share": NAN}, "'knob.share'"),
@@ -109,7 +109,9 @@ LOW, HIGH = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
 def unbounded(schema: Any) -> list[Any]:
     """Numbers without both ends, and texts of any length, in a JSON schema."""
     if not isinstance(schema, dict):
-        return [each for part in schema for each in unbounded(part)] if type(schema) is list else []
+        return (
+            [found for part in schema for found in unbounded(part)] if type(schema) is list else []
+        )
     if {"enum", "const"} & set(schema):
         return []
     kind = schema.get("type")
@@ -119,7 +121,7 @@ def unbounded(schema: Any) -> list[Any]:
     inner = [
         unbounded(part) for key, part in schema.items() if key not in ("enum", "propertyNames")
     ]
-    return [*([schema] if is_open or is_long else []), *(each for part in inner for each in part)]
+    return [*([schema] if is_open or is_long else []), *(found for part in inner for found in part)]
 
 
 @pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.SweepSettings"])
@@ -132,11 +134,9 @@ def test_every_number_and_text_has_a_range(target: str) -> None:
         assert not unbounded(schema), f"{target}.{key}: declare a range (rgbt.ranges)"
 
 
-def test_top_level_keys_have_a_range() -> None:
-    assert not unbounded(TypeAdapter(Values).json_schema()["properties"]["seed"])
-    text = {"pretrained": None, "out": None}
-    good = {"name": "a", "seed": 0, "runs_dir": "runs", "fresh": False, **text}
-    assert check_value("", good, Values) == good
-    for wrong in (-1, 2**32, True, 0.5, None):
-        with pytest.raises(InputError, match="^'seed'"):
-            check_value("", {**good, "seed": wrong}, Values)
+@pytest.mark.parametrize("wrong", [-1, 2**32, True, 0.5, None])
+def test_top_level_keys_have_a_range(wrong: Any) -> None:
+    assert not unbounded(TypeAdapter(VALUES["seed"]).json_schema())
+    assert check_value("seed", 0, VALUES["seed"]) == 0
+    with pytest.raises(InputError, match="^'seed'"):
+        check_value("seed", wrong, VALUES["seed"])

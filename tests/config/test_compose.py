@@ -9,12 +9,13 @@ from typing import Any
 
 import hydra
 import pytest
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config import compose as composing_module
-from rgbt.config.command import composing
-from rgbt.config.compose import available, compose, conf_dir, own_hydra, searching
+from rgbt.config.compose import available, compose, composed, conf_dir, own_hydra, searching
+from rgbt.config.overrides import composing
 
 OWN = "# @package _global_\ndefaults:\n  - sh_source\n  - _self_\nname: own_stage\n"
 
@@ -78,9 +79,9 @@ def test_a_file_holds_several_choices(own: Path, monkeypatch: pytest.MonkeyPatch
     (own / "model" / "other.yaml").write_text(f"{VARIED}  mid: null\n")
     monkeypatch.setenv("RGBT_CONF", str(own))
     names = {"my_net", "my_net_18", "my_net_big_one", "other_18", "other_big_one", "other_mid"}
-    listed = {each for each in available("model") if each.startswith(("my_net", "other"))}
+    listed = {name for name in available("model") if name.startswith(("my_net", "other"))}
     assert listed == names  # a variant without values is the name of the file's own
-    found = {each: compose([f"model={each}", "seed=7"]).model for each in sorted(names)}
+    found = {name: compose([f"model={name}", "seed=7"]).model for name in sorted(names)}
     assert found["my_net"] == found["other_mid"]
     assert "_variants_" not in found["my_net"]
     assert found["my_net"].num_classes == 9
@@ -151,3 +152,25 @@ def test_word_that_hydra_refuses_is_one_line(words: str, said: str) -> None:
         compose(words.split())
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+OWN_SWEEP = """# @package _global_
+defaults:
+  - sh_source
+  - override /hydra/sweeper: study
+  - _self_
+hydra: {mode: MULTIRUN, sweeper: {workers: 2}}
+"""
+
+
+def test_files_and_words_may_choose_for_hydra(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra's own files are left out of a composition where no word names them."""
+    (own / "experiment" / "own_sweep.yaml").write_text(OWN_SWEEP)
+    monkeypatch.setenv("RGBT_CONF", str(own))
+    assert not composed(["+experiment=own_stage"])[1]
+    for words in ([], ["hydra.sweeper.workers=3"], ["hydra/launcher=basic"]):
+        config, is_search = composed(["+experiment=own_sweep", *words])
+        assert is_search
+        assert config == compose(["+experiment=own_stage", "name=sh_source"])
+    with pytest.raises(MissingConfigException, match="hydra/launcher/nothing"):
+        composed(["hydra/launcher=nothing"])

@@ -25,8 +25,8 @@ from hydra.core.global_hydra import GlobalHydra
 with hydra.initialize_config_dir(sys.argv[1], version_base=None):
     config = hydra.compose("config", ["+thing=one"])
     path = GlobalHydra.instance().config_loader().get_search_path().get_path()
-print(json.dumps([config["a"], [each.path for each in path],
-    [each for each in sys.modules if each.split(".")[0] in ("rgbt", "torch", "optuna")]]))
+print(json.dumps([config["a"], [element.path for element in path],
+    [module for module in sys.modules if module.split(".")[0] in ("rgbt", "torch", "optuna")]]))
 """
 
 
@@ -42,7 +42,7 @@ def others(tmp_path: Path) -> Path:
 
 def search_path() -> list[tuple[str, str]]:
     path = GlobalHydra.instance().config_loader().get_search_path().get_path()
-    return [(str(each.provider), str(each.path)) for each in path]
+    return [(str(element.provider), str(element.path)) for element in path]
 
 
 def test_another_program_imports_and_sees_nothing_of_rgbt(others: Path) -> None:
@@ -77,7 +77,7 @@ def test_own_folders_follow_rgbt_s(monkeypatch: pytest.MonkeyPatch) -> None:
         assert search_path() == [
             ("hydra", "pkg://hydra.conf"),
             ("main", f"rgbt://{conf_dir()}"),
-            *(("RGBT_CONF", each) for each in folders),
+            *(("RGBT_CONF", folder) for folder in folders),
             ("schema", "structured://"),
         ]
 
@@ -101,8 +101,8 @@ def test_source_lists_groups_and_choices(others: Path) -> None:
     (others / "thing" / "__pycache__").mkdir()
     source = RgbtConfigSource("main", f"rgbt://{others}")
     assert (source.available(), source.is_group("thing"), source.is_group("one")) == (1, 1, 0)
-    assert [source.is_config(f"thing/{each}") for each in ("one", "one_b", "b")] == [1, 1, 0]
-    found = [source.list("thing", each) for each in (None, ObjectType.CONFIG, ObjectType.GROUP)]
+    assert [source.is_config(f"thing/{name}") for name in ("one", "one_b", "b")] == [1, 1, 0]
+    found = [source.list("thing", kind) for kind in (None, ObjectType.CONFIG, ObjectType.GROUP)]
     assert found == [["deep", "one", "one_b"], ["one", "one_b"], ["deep"]]
     assert source.list("", ObjectType.GROUP) == ["thing"]
     assert not RgbtConfigSource("main", f"rgbt://{others / 'no'}").available()

@@ -58,7 +58,7 @@ OTHERS = [
 ]
 
 
-@pytest.mark.parametrize("target", OTHERS, ids=[str(each)[:40] for each in OTHERS])
+@pytest.mark.parametrize("target", OTHERS, ids=[str(target)[:40] for target in OTHERS])
 def test_others_targets_are_refused_before_they_are_imported(lab: Path, target: Any) -> None:
     assert (lab / "rgbt_evil.py").is_file()
     for settings in (

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from rgbt.config.command import composing
 from rgbt.config.compose import check_keys, compose
 from rgbt.config.options import readable_paths
+from rgbt.config.overrides import composing
 from rgbt.config.plain_command import COMMANDS
 from tests.docs.pages import ROOT, Block, Page, difference, filled, pages, problems_of, write
 from tests.docs.small import ENOUGH, SMOKE

@@ -14,7 +14,7 @@ from rgbt.engine.checkpoint import restore_optimizer
 from rgbt.engine.device import Recomputed, fix_threads, place, prepare_training
 from rgbt.engine.optimizers import AdamW
 from rgbt.engine.settings import TrainerSettings
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from tests.engine.test_trainer import ADAMW, SETTINGS
 from tests.models.plain import generator, images, nano
 
@@ -111,7 +111,7 @@ def test_recomputation_leaves_the_buffers_of_the_network() -> None:
 def own(*recomputed: str) -> nn.Module:
     """A user's network."""
     net = nn.ModuleDict({"blocks": nn.Sequential(nn.Linear(3, 3), nn.Linear(3, 3))})
-    net.record = Record(recomputed=recomputed)
+    net.record = NetworkRecord(recomputed=recomputed)
     return net
 
 

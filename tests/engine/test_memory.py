@@ -18,7 +18,7 @@ from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.evaluation.predict import Predictor
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from tests.commands import Call, Trained, assert_one_sentence, losses, short, train
 
 CUDA = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 15 GiB"
@@ -67,7 +67,7 @@ def test_evaluation_without_memory_names_its_batch(
 def test_settings_with_less_memory() -> None:
     """Those that are set already, or that cannot be set, are not named."""
     trainer: TrainerSettings = build(compose([]).trainer)
-    network = Record(recomputed=("blocks.*",))
+    network = NetworkRecord(recomputed=("blocks.*",))
     said = training_advice(trainer, 14, network, (48, 64))
     assert "checkpointing=true or more trainer.devices." in said
     assert "data.batch_size=7 trainer.accumulate=2 or a smaller transform.crop_hw or" in said

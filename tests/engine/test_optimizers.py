@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from tests.engine.test_trainer import ADAMW
 from tests.models.plain import nano
 
@@ -25,7 +25,7 @@ def two_heads() -> nn.Module:
     """A backbone and two heads."""
     heads = nn.ModuleDict({"source": nn.Linear(2, 1), "target": nn.Linear(2, 1)})
     model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "heads": heads})
-    model.record = Record(pretrained_parts=("backbone.",))
+    model.record = NetworkRecord(pretrained_parts=("backbone.",))
     return model
 
 
@@ -88,7 +88,7 @@ def test_steps_are_those_written_out(kind: str) -> None:
 def test_adamw_decays_weights_and_neither_norms_nor_embeddings(decay_biases: bool) -> None:
     model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
     model["query"] = nn.Embedding(3, 2)
-    model.record = Record(pretrained_parts=("backbone.",))
+    model.record = NetworkRecord(pretrained_parts=("backbone.",))
     settings = {"lr": 1.0, "backbone_multiplier": 0.1, "weight_decay": 0.5}
     groups = AdamW(**{**ADAMW, **settings, "decay_biases": decay_biases})(model).param_groups
     found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}

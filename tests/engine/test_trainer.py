@@ -21,7 +21,7 @@ from rgbt.engine.schedules import Poly, ThesisPoly
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Batch, GeneratorOf, Phase
 from tests.checkpoints.test_torch_files import same
 
@@ -379,7 +379,7 @@ def test_gradients_are_clipped_once_per_phase(
 def test_rates_of_parts_follow_schedule_in_two_sessions(tmp_path: Path, head_rate: Any) -> None:
     """Rates lr (1 - t / T)^0.9, t from 1; or constant, of the head of "SH-Maximum squares loss"."""
     model = nn.ModuleDict({"backbone": nn.Linear(3, 2), "head": nn.Linear(2, 1)})
-    model.record = Record(pretrained_parts=("backbone.",))
+    model.record = NetworkRecord(pretrained_parts=("backbone.",))
     logged: list[Any] = []
 
     def phases(batch: Batch, _: GeneratorOf) -> Iterator[Phase]:

@@ -20,7 +20,7 @@ from rgbt.evaluation.batch_norm import normalised
 from rgbt.evaluation.measure import measure, measurement_of
 from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement, Statistics
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.types import Output
 from tests.commands import SPLITS, words_of
@@ -29,7 +29,7 @@ from tests.commands import SPLITS, words_of
 class AboveMean(nn.Module):
     """Class 1 where the thermal image is above the running mean, else class 0."""
 
-    record = Record(views=("rgbt",))
+    record = NetworkRecord(views=("rgbt",))
 
     def __init__(self) -> None:
         super().__init__()

@@ -18,7 +18,7 @@ from rgbt.evaluation.measure import Measured, joined, measure, measurement_of
 from rgbt.metrics.details import DEFAULTS, KINDS, SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.named import value
 from rgbt.processes import collected, rank
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.types import Output, SceneMaps
 from tests.commands import SPLITS, words_of
@@ -32,7 +32,7 @@ SURE = 3.0
 class Decoder(nn.Module):
     """Predicts the class grey level / 28 of the thermal image, or of red for the view "rgb"."""
 
-    record = Record(views=("rgbt", "rgb"))
+    record = NetworkRecord(views=("rgbt", "rgb"))
 
     def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
         seen = rgb[:, 0] if views == ("rgb",) else thermal[:, 0]

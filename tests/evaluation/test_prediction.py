@@ -18,7 +18,7 @@ from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.measure import measurement_of
 from rgbt.evaluation.predict import Predictor, heads_of, view_of
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.types import Batch, Output
 from tests.commands import ON_CPU
@@ -27,7 +27,7 @@ from tests.engine.test_evaluate import FABRIC, ROW, Ramp, grey
 
 
 class Network:
-    record = Record(views=("rgb", "thermal"))
+    record = NetworkRecord(views=("rgb", "thermal"))
 
 
 def session_of(source: dict[str, object], **changes: object) -> SimpleNamespace:
@@ -73,7 +73,7 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
     calls: list[tuple[int, str | None]] = []
 
     class Heads(nn.Module):
-        record = Record(views=("rgb",))
+        record = NetworkRecord(views=("rgb",))
 
         def forward(self, rgb: Tensor, thermal: Tensor, *, views: object, head: str) -> Output:
             calls.append((len(rgb), head))
@@ -104,7 +104,7 @@ def test_classes_and_confidences_agree_with_the_probabilities() -> None:
     data = grey([ROW, ROW[::-1]], (4, 14))
     session: Any = session_of({"head": None, "view": "rgb"})
     session.model, session.autocast = Ramp(), FABRIC.autocast
-    session.model.record = Record(views=("rgb",))
+    session.model.record = NetworkRecord(views=("rgb",))
     session.prediction = Prediction(mirrored=True, window_hw=(2, 4), align_corners=True)
     predictor = Predictor(session)
     shares = predictor.probabilities(data)

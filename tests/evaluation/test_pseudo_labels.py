@@ -23,7 +23,7 @@ from rgbt.data.pseudo_labels import PseudoLabels
 from rgbt.engine.evaluate import label_scores, shares
 from rgbt.evaluation.images import labels_table, write_pseudo_labels
 from rgbt.evaluation.measure import measurement_of
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.types import Batch, Output, View
 from tests.conftest import write_png
@@ -41,7 +41,7 @@ class Fixed(nn.Module):
     """Class (thermal + 2 * red) with the probability `SURE[thermal]`, the rest shared by others."""
 
     num_classes = 9
-    record = Record(views=("rgbt", "thermal"))
+    record = NetworkRecord(views=("rgbt", "thermal"))
 
     def __init__(self) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class Constant(nn.Module):
 
     def __init__(self, scores: list[float], outputs: str) -> None:
         super().__init__()
-        self.record = Record(outputs=outputs, views=("rgbt", "thermal"))
+        self.record = NetworkRecord(outputs=outputs, views=("rgbt", "thermal"))
         self.scores = torch.tensor(scores)
 
     def forward(self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = ()) -> Output:

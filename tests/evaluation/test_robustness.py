@@ -21,7 +21,7 @@ from rgbt.evaluation.robustness import conditions, measure_all, robustness_grid,
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.scores import summary
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from tests.commands import SPLITS, words_of
 from tests.measured import measurement
@@ -30,7 +30,7 @@ CLASSES = ("road", "car")
 
 
 class Network(nn.Module):
-    record = Record(views=("rgbt", "rgb", "thermal"))
+    record = NetworkRecord(views=("rgbt", "rgb", "thermal"))
 
 
 class Opener:

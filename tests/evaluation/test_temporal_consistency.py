@@ -30,7 +30,7 @@ from rgbt.evaluation.pairs.count import (
 from rgbt.evaluation.pairs.frames import flow_source, pairs_of
 from rgbt.evaluation.pairs.scenes import FlowRecord, flow_record
 from rgbt.metrics.pairs import ca, tc
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.transforms.views import read_angles
 from rgbt.types import Output
@@ -47,7 +47,7 @@ def one_hot(classes: Tensor) -> Output:
 class Decoder(nn.Module):
     """Predicts what the thermal image says: class = grey level / 28."""
 
-    record = Record(views=("rgbt",))
+    record = NetworkRecord(views=("rgbt",))
 
     def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
         return one_hot((thermal[:, 0] * 255 / 28).round().long().clamp(0, 8))
@@ -56,7 +56,7 @@ class Decoder(nn.Module):
 class Oracle(nn.Module):
     """Knows the right answer of every image, by its bytes."""
 
-    record = Record(views=("rgbt",))
+    record = NetworkRecord(views=("rgbt",))
 
     def __init__(self) -> None:
         super().__init__()

@@ -31,7 +31,7 @@ from rgbt.exported.onnx_network import (
     onnx_bytes,
 )
 from rgbt.metrics.counts import Counts
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from rgbt.types import Output
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, code_of, short
 from tests.conftest import write_data
@@ -293,11 +293,11 @@ def test_dynamic_graph_is_compared_at_other_sizes(name: str, is_right: bool) -> 
     """One network has the same scores at any size; in the other, pools have the traced size."""
     torch.manual_seed(0)
     network = build(compose([f"model={name}", "model.num_classes=9"]).model).eval()
-    graph = ScoresOfImages(network, view=record_of(network).views[0], head=None)
+    graph = ScoresOfImages(network, view=record_of(network, NetworkRecord).views[0], head=None)
     made = Description(
         network=name,
         classes=tuple("abcdefghi"),
-        view=record_of(network).views[0],
+        view=record_of(network, NetworkRecord).views[0],
         outputs="scores",
         image_hw=(48, 64),
         dynamic=True,
@@ -321,7 +321,7 @@ def test_dynamic_graph_is_compared_at_other_sizes(name: str, is_right: bool) -> 
 def test_scores_of_the_graph_are_those_of_the_network(name: str) -> None:
     torch.manual_seed(0)
     network = build(compose([f"model={name}", "model.num_classes=9"]).model).eval()
-    view = record_of(network).views[0]
+    view = record_of(network, NetworkRecord).views[0]
     exported = exported_network(network, view, (64, 96), name)
     graph = ScoresOfImages(network, view=view, head=None)
     images = [(torch.rand(1, 3, 64, 96), torch.rand(1, 1, 64, 96)) for _ in range(6)]

@@ -24,7 +24,7 @@ from rgbt.losses.unlabelled import (
     logistic,
     pseudo_labels,
 )
-from rgbt.requirements import Record, check_requirements
+from rgbt.requirements import DatasetRecord, check_requirements
 from rgbt.types import Output
 from tests.losses.problems import NOTHING, batch_of, seeded
 
@@ -57,7 +57,7 @@ def test_class_weights() -> None:
     part = part_of(CrossEntropy(class_weights=(1.0, 2.0, 0.5)), logits, batch_of(label))
     expected = F.cross_entropy(logits, label, torch.tensor([1.0, 2.0, 0.5]), ignore_index=255)
     assert torch.allclose(part, expected)
-    records = {"dataset": SimpleNamespace(record=Record(num_classes=3))}
+    records = {"dataset": SimpleNamespace(record=DatasetRecord(num_classes=3))}
     check_requirements({**records, "loss": CrossEntropy(class_weights=(1.0, 2.0, 3.0))})
     with pytest.raises(InputError, match=r"loss.class_weights=\[1.0, 2.0\] requires num_classes=2"):
         check_requirements({**records, "loss": CrossEntropy(class_weights=(1.0, 2.0))})

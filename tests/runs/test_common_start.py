@@ -76,7 +76,7 @@ def test_start_shares_what_does_not_change_its_result() -> None:
 
 def test_stages_of_a_chain_begin_with_the_start() -> None:
     run = spec_of("multi_head_night", "seed=2", "runs_dir=/none")
-    assert [(each.name, each.seed) for each in run.pending] == [
+    assert [(upstream.name, upstream.seed) for upstream in run.pending] == [
         ("start_deeplabv2_heads", 1002),
         ("start_pspnet", 1002),
         ("thermal_teacher", 2),

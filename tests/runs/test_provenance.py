@@ -51,7 +51,7 @@ def test_code_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     dirty = checkout_of(code)
     assert (dirty["git_commit"], dirty["git_dirty"]) == (clean["git_commit"], True)
     assert "+a = 2" in dirty["diff"]
-    assert [Path(each).name for each in dirty["untracked"]] == ["new.py"]
+    assert [Path(file).name for file in dirty["untracked"]] == ["new.py"]
     monkeypatch.setenv("PATH", "")
     assert checkout_of(code)["git_commit"] is None, "without git"
 

@@ -53,7 +53,7 @@ def test_write_atomic_is_whole_or_not_at_all(
     with pytest.raises(type(error)):
         write_atomic(path, b"new")
     assert path.read_bytes() == b"old"
-    assert [each.name for each in tmp_path.iterdir()] == ["a.json"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_truncate_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def finished(tmp_path: Path) -> RunFolder:
 
 def test_set_aside_keeps_finished_runs_outside_their_group(tmp_path: Path) -> None:
     kept = [set_aside(finished(tmp_path)), set_aside(finished(tmp_path))]
-    paths = [each.path for each in kept if each]
+    paths = [folder.path for folder in kept if folder]
     assert paths == [tmp_path / "replaced" / "abc-1", tmp_path / "replaced" / "abc-2"]
     assert not (tmp_path / "abc").exists()
     assert read_result(paths[0]) == {"key": "abc"}

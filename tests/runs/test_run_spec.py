@@ -73,7 +73,7 @@ def test_key_counts_weights_and_pseudo_labels_by_content(tmp_path: Path) -> None
         folder.mkdir()
         write_json(folder / "pseudo_labels.json", {"digest": text})
     for setting, named in (("model.weights", files), ("domains.target.labels", folders)):
-        one, same, other = (key_of("sh_both", f"{setting}={each}") for each in named)
+        one, same, other = (key_of("sh_both", f"{setting}={value}") for value in named)
         assert one == same
         assert len({one, other, key_of("sh_both")}) == 3
     run = spec_of("sh_both", f"domains.target.labels={folders[0]}")
@@ -95,7 +95,7 @@ def test_key_counts_what_is_taken_from_upstream_runs() -> None:
         ),
     }
     for experiment, changes in words.items():
-        keys = {key_of(experiment, each) for each in changes} | {key_of(experiment)}
+        keys = {key_of(experiment, change) for change in changes} | {key_of(experiment)}
         assert len(keys) == 4
     first, second = (spec_of("multi_head_night_stage1", f"seed={seed}") for seed in (0, 1))
     assert all(a.key != b.key for a, b in zip(first.upstream, second.upstream, strict=True))
@@ -154,7 +154,7 @@ def test_labels_folder_names_what_is_predicted(typed: str, name: str) -> None:
 def test_run_with_another_seed_equals_composing_that_seed(experiment: str) -> None:
     made, direct = spec_of(experiment, "seed=0").with_seed(3), spec_of(experiment, "seed=3")
     assert (made.key, made.plain, made.overrides) == (direct.key, direct.plain, direct.overrides)
-    assert [each.key for each in made.upstream] == [each.key for each in direct.upstream]
+    assert [run.key for run in made.upstream] == [run.key for run in direct.upstream]
     drawn = spec_of("grbm", "seeds.order=7").with_seed(2).drawn
     assert (drawn.weights, drawn.order, drawn.masks) == (2, 7, 2)
 

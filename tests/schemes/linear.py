@@ -20,7 +20,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.models.inputs import expand_cells
 from rgbt.randomness import torch_generator
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import MaskerRecord, SchemeRecord, record_of
 from rgbt.types import Batch, MaskPair, Output, View
 from tests.losses.problems import batch_of
 
@@ -71,7 +71,7 @@ def cross_entropy(output: Output, batch: Batch, generator: torch.Generator) -> V
 
 
 class Nothing:
-    record = Record(hides_cells=False)
+    record = MaskerRecord(hides_cells=False)
 
 
 def domains(heads: bool, **target: Any) -> Domains:
@@ -113,10 +113,11 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     fabric = Fabric(accelerator="cpu", devices=1)
     builder = SGD(lr=LR, backbone_multiplier=1.0, momentum=MOMENTUM, weight_decay=0.0)
     built = {
-        name: builder(model, without=parts) for name, parts in record_of(scheme).optimizers.items()
+        name: builder(model, without=parts)
+        for name, parts in record_of(scheme, SchemeRecord).optimizers.items()
     }
-    others = record_of(scheme).networks
-    builders = record_of(scheme).builders
+    others = record_of(scheme, SchemeRecord).networks
+    builders = record_of(scheme, SchemeRecord).builders
     built |= {name: build(others[name]) for name, build in builders.items()}
     settings: dict[str, Any] = {
         "max_steps": steps,

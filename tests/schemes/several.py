@@ -19,7 +19,7 @@ from rgbt.maskers.masker import Masker
 from rgbt.models.critic import Critic
 from rgbt.processes import num_processes, own, total
 from rgbt.randomness import torch_generator
-from rgbt.requirements import record_of
+from rgbt.requirements import SchemeRecord, record_of
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import IGNORE, Batch, TwoDomains
@@ -139,7 +139,7 @@ def two_domains(make: Any, *given: Any, heads: bool = False, step: int = 0, **mo
         scheme = replace(scheme, loss=THREE)
     pseudo = more.get("weighed_by_confidence", False)
     data = TwoDomains(batch(3, "source"), batch(3, "target", confidence=pseudo), step)
-    record = record_of(scheme)
+    record = record_of(scheme, SchemeRecord)
     trained = {name: record.networks[name] for name in record.builders}
     return Case(scheme, {"model": net, **trained}, data)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rgbt.data.domains import Domain, Domains
-from rgbt.requirements import Record
+from rgbt.requirements import MaskerRecord
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import Batch, MaskPair, Output
@@ -73,7 +73,7 @@ class Halves:
 
 
 class Nothing(Halves):
-    record = Record(hides_cells=False)
+    record = MaskerRecord(hides_cells=False)
 
 
 def scheme(masker: object, **weights: float) -> CRM:

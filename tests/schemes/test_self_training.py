@@ -18,7 +18,7 @@ from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.distances import FeatureDistance
 from rgbt.models.parts import drop_channels
 from rgbt.randomness import torch_generator
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import MaskerRecord, SchemeRecord, record_of
 from rgbt.schemes.self_training import (
     CONFIDENCE,
     CONFIDENT_SHARE,
@@ -154,7 +154,7 @@ THRESHOLD = 0.44
 class Halves:
     """Hides the left half of RGB, and the right half of thermal."""
 
-    record = Record(hides_cells=True)
+    record = MaskerRecord(hides_cells=True)
 
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
@@ -309,7 +309,7 @@ def test_feature_distance_is_measured_on_things_of_the_source() -> None:
     parts = phase_of(scheme_of(model), data).parts
     assert set(phase.parts) - set(parts) == {"source/feature_distance"}
     assert all(torch.equal(phase.parts[name], parts[name]) for name in parts)
-    assert set(record_of(scheme).networks) == {"teacher"}
+    assert set(record_of(scheme, SchemeRecord).networks) == {"teacher"}
 
 
 def test_initial_network_sees_the_source_with_its_own_statistics() -> None:
@@ -368,7 +368,7 @@ def test_two_heads_train_each_domain_with_its_own() -> None:
     assert [head for _, head, _ in model.calls] == ["day", "dark", "dark"]
     teacher = scheme.teacher.network()
     assert [head for _, head, _ in teacher.calls] == ["dark"]
-    assert record_of(scheme).networks == {"teacher": scheme.teacher.average}
+    assert record_of(scheme, SchemeRecord).networks == {"teacher": scheme.teacher.average}
 
 
 @pytest.mark.parametrize("changes", [{}, DISTANCE])

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.models.mask2former.network import semantic_logits
-from rgbt.requirements import Record
+from rgbt.requirements import LossRecord
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.views import VirtualView
 from rgbt.types import Batch, Frame, Output
@@ -55,7 +55,7 @@ class Net(nn.Module):
 class Recorded:
     """A loss of two frames, and of their queries, that keeps what it is given."""
 
-    record = Record(frames=2, reads_warped=True)
+    record = LossRecord(frames=2, reads_warped=True)
 
     def __call__(
         self, first: Frame, second: Frame, warped: Tensor, valid: Tensor, generator: Any

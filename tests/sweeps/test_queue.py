@@ -67,7 +67,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sweeps.plan.table.study_names", list)
     # The scores of fake runs are not those of their counts.
-    monkeypatch.setattr("rgbt.runs.result.RunResult.check", lambda _: None)
+    monkeypatch.setattr("analysis.archive.check_result", lambda _: None)
     write_table("one", ("crm", "baseline"), [("crm", "baseline")])
     write_table("two", ("cmx", "rtfnet", "mfnet"), [("cmx", "rtfnet"), ("cmx", "mfnet")])
     write_table("wrong", ("grbm",), [])

@@ -15,7 +15,7 @@ from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.requirements import record_of
+from rgbt.requirements import TransformRecord, record_of
 from rgbt.transforms.fixed_size import recoloured
 from rgbt.types import IGNORE
 from tests.composed import specified
@@ -54,9 +54,9 @@ def test_recoloured_by_hand() -> None:
 def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch) -> None:
     chances = ("drop_probability", "thermal_probability", "class_probability")
     full = replace(made("heatnet"), **dict.fromkeys(chances, 1.0))
-    target = record_of(full).for_target
+    target = record_of(full, TransformRecord).for_target
     assert target == replace(full, **dict.fromkeys(chances, 0.0))
-    assert record_of(target).for_target is None
+    assert record_of(target, TransformRecord).for_target is None
     # Training takes the transform of each domain.
     taken: list[Any] = []
     monkeypatch.setattr(

@@ -15,7 +15,7 @@ import torch
 from rgbt.checks import InputError
 from rgbt.geometry.camera import homography
 from rgbt.geometry.warp import Warp
-from rgbt.requirements import Record
+from rgbt.requirements import DatasetRecord
 from rgbt.transforms.views import ViewSets, VirtualView, read_angles
 from rgbt.types import IGNORE, Batch
 from tests.geometry.views import RELEASED as CAMERA
@@ -281,7 +281,7 @@ def test_unknown_sets_and_sets_without_a_split_are_refused(tmp_path: Path) -> No
 def test_views_painting_background_require_it_as_class_0() -> None:
     (required,) = sets("released_1").record.requires
     assert (required.node, required.setting) == ("dataset", "consistency.view.outside=background")
-    assert required.is_met_by(Record(first_class="background"))
-    assert not required.is_met_by(Record(first_class="object"))
+    assert required.is_met_by(DatasetRecord(first_class="background"))
+    assert not required.is_met_by(DatasetRecord(first_class="object"))
     assert not sets().record.requires
     assert not sets("released_1", view=released(outside="ignore")).record.requires

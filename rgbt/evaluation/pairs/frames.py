@@ -16,9 +16,9 @@ import torch
 
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
+from rgbt.config.overrides import composing
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import NextFrames

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from rgbt.assembly.load_run import trusted_settings
 from rgbt.checks import InputError, one_line, split_list
-from rgbt.config.command import composing
 from rgbt.config.component import Component
 from rgbt.config.compose import check_keys, compose
+from rgbt.config.overrides import composing
 from rgbt.config.values import check_value
 from rgbt.data.domains import Domains
 from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
@@ -25,7 +25,7 @@ from rgbt.exported.onnx_network import exported_network, require_packages
 from rgbt.files.yaml_files import read_yaml
 from rgbt.randomness import derive, torch_generator
 from rgbt.ranges import Size, Text
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from rgbt.runs.folder import find_run
 from rgbt.runs.specify import load_spec
 from rgbt.types import Batch, View
@@ -153,7 +153,7 @@ class PreparedNetwork:
             self.trainable += weights.numel() if weights.requires_grad else 0
         # The counter of operations follows gradients otherwise, which a prediction does not have.
         self._model: nn.Module = model.eval().requires_grad_(False).to(self.device)
-        self._view = network.view or record_of(model).views[0]
+        self._view = network.view or record_of(model, NetworkRecord).views[0]
         self._batch = random_batch(batch_size, network.image_hw).to(self.device)
 
     def autocast(self) -> AbstractContextManager[Any]:

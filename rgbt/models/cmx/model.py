@@ -25,7 +25,7 @@ from rgbt.models.cmx.parts import (
 from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.models.parts import Keep, check_heads, drop_channels, stochastic_depth
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
 
 STREAMS = ("", "extra_")  # before the names of the modules: RGB, and the other modality
@@ -172,7 +172,7 @@ def _resized(x: Tensor, hw: Sequence[int]) -> Tensor:
 class CmxNetwork(Network):
     """Two streams and the decoder; CMX and CMNeXt differ in what these are made of."""
 
-    record = Record(
+    record = NetworkRecord(
         views=("rgbt",),
         pretrained_parts=("backbone.",),
         recomputed=("backbone.*block*.*", "backbone.FRMs.*", "backbone.FFMs.*"),

@@ -1,6 +1,7 @@
 """Tools for adapters, which build the networks of odd repositories.
 
-An adapter is a Python file beside a recipe, with a function that returns the network. It imports
+An adapter is a function that returns the network: ours are in `rgbt/models/external/adapters.py`, a
+user's in a Python file beside their recipe. It imports
 modules of the checkout, and keeps constructors from reading weights of files, so that a run starts
 from the weights that its configuration names.
 """

@@ -26,7 +26,7 @@ from rgbt.files.adapters import adapter_of
 from rgbt.models.inputs import Inputs, luma_of, only_view, padded
 from rgbt.processes import rank
 from rgbt.ranges import NumClasses, Size, Text
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import NetworkRecord, Requirement
 from rgbt.types import MaskPair, Output, View
 
 OWN = "network."  # before every name of the author's network in `state_dict`
@@ -97,7 +97,7 @@ class ExternalNetwork(nn.Module):
     ) -> None:
         super().__init__()
         reads = Requirement("loss", "reads_auxiliary", True, "model.auxiliary")
-        self.record = Record(
+        self.record = NetworkRecord(
             views=("thermal",) if feed == "thermal" else ("rgbt",),
             auxiliary=auxiliary is not None,
             requires=(reads,) if auxiliary is not None else (),

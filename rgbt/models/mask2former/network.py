@@ -16,7 +16,7 @@ from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.head import GROUPS, HeadShape, PixelDecoder, Predictor
 from rgbt.models.parts import check_heads
 from rgbt.ranges import Channels
-from rgbt.requirements import Record
+from rgbt.requirements import NetworkRecord
 from rgbt.types import VIEWS, MaskPair, Output, View
 
 FAINTEST = 1e-6  # the smallest semantic score whose logarithm is taken
@@ -28,7 +28,7 @@ FusionKind = Literal["max", "add"]
 HiddenDim = Annotated[Channels, MultipleOf(GROUPS)]
 NumQueries = Annotated[int, Interval(ge=1, le=10_000)]
 
-RECORD = Record(
+RECORD = NetworkRecord(
     outputs="masks",
     views=VIEWS,
     stacks_passes=True,

@@ -19,7 +19,7 @@ from rgbt.exported.onnx_network import exported_network
 from rgbt.files.adapters import adapter_of
 from rgbt.models.external.adapting import Untrained, replaced
 from rgbt.models.external.network import edge_map, picked, scores_at, structure
-from rgbt.requirements import record_of
+from rgbt.requirements import NetworkRecord, record_of
 from tests.models.external.standins import (
     HEAD,
     PAIR,
@@ -150,12 +150,20 @@ def test_untrained_functions_ignore_pretrained() -> None:
     assert (changed.build, module.build(2)) == (1, (2, False))  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", ["../external/adapters.py", "/tmp/adapters.py", "none.py"])  # noqa: S108
-def test_adapter_lies_beside_a_recipe(name: str) -> None:
+@pytest.mark.parametrize("name", ["../odd.py", "../external/odd.py", "{}/odd.py", "none.py"])
+def test_adapter_lies_beside_a_recipe(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = name.format(tmp_path)
+    recipes = tmp_path / "conf/model/external"
+    write_checkout(recipes, {"odd.py": "", "../odd.py": ""})
+    write_checkout(tmp_path, {"odd.py": ""})
+    monkeypatch.setenv("RGBT_CONF", f"{tmp_path / 'none'}, file://{tmp_path / 'conf'}")
     assert adapter_of("model.net:Net") is None
-    found = adapter_of("adapters.py:network")
-    assert found is not None
-    assert found.is_file()
+    assert adapter_of("odd.py:network") == recipes / "odd.py"
+    ours = adapter_of("adapters.py:network")
+    assert ours is not None
+    assert ours.is_file()
     with pytest.raises(FileNotFoundError):
         adapter_of(f"{name}:network")
 
@@ -310,7 +318,7 @@ def test_training_may_read_other_scores(tmp_path: Path) -> None:
     assert evaluated.aux == {}
     torch.testing.assert_close(trained.logits, -2 * evaluated.logits)
     torch.testing.assert_close(trained.aux["aux_logits"], evaluated.logits)
-    record = record_of(net)
+    record = record_of(net, NetworkRecord)
     assert record.auxiliary
     assert [(each.node, each.key) for each in record.requires] == [("loss", "reads_auxiliary")]
 

@@ -11,9 +11,9 @@ from typing import Any, get_args
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import flatten
+from rgbt.config.overrides import composing
 from rgbt.runs.run_spec import RunSpec
 from sweeps.plan.planner import Planner, specify_run
 from sweeps.plan.request import TableRequest, check_equal_runs

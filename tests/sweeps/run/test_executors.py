@@ -9,7 +9,7 @@ import pytest
 from hydra.errors import MissingConfigException
 
 from rgbt.checks import InputError
-from rgbt.config.command import hydra_sentence
+from rgbt.config.overrides import hydra_sentence
 from sweeps.run.executors import open_executor
 from sweeps.run.local import LocalExecutor
 from tests.sweeps.fakes import settings

@@ -1,5 +1,7 @@
 """Builders of networks whose repositories need more than a call, one for each recipe that names it.
 
+`model.constructor` names one: "adapters.py:gmnet". The file is read by its path and its digest is
+part of the run key, as that of a user's own adapter; its functions import modules of a checkout.
 They give random weights instead of ImageNet's, and leave out data sets and packages that a
 repository imports without using them for its network.
 """
