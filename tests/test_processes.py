@@ -26,7 +26,6 @@ from rgbt.engine.batch_norm import (
     share_running_statistics,
     synchronise_batch_norm,
 )
-from rgbt.engine.trainer import average_gradients
 from tests.conftest import WriteMFNet
 from tests.models.plain import generator
 from tests.processes import run_in_processes
@@ -73,16 +72,17 @@ def sharing() -> dict[str, Any]:
         "mean_count": processes.mean_count(torch.tensor(3 * rank)),
         "largest": processes.largest(5 - rank),
         "averaged": averaged(),
-        "objects": (processes.agreed(rank), processes.collected(("of", rank))),
+        "once": processes.computed_once(lambda: (rank, processes.num_processes())),
+        "objects": processes.collected(("of", rank)),
     }
 
 
 def averaged() -> list[float | None]:
-    """Gradients of three parameters after `average_gradients`."""
+    """Gradients of three parameters after `processes.average_gradients`."""
     parameters = [nn.Parameter(torch.zeros(2, dtype=each)) for each in DTYPES]
     for factor, parameter in zip((1, 0, 10), parameters, strict=True):
         parameter.grad = torch.full_like(parameter, factor * processes.rank()) if factor else None
-    average_gradients(parameters)
+    processes.average_gradients(parameters)
     return [None if each.grad is None else float(each.grad[1]) for each in parameters]
 
 
@@ -103,7 +103,8 @@ def test_parts_wholes_and_sums() -> None:
         assert found["largest"] == 5
         # Of each parameter the mean of rank and of 10 rank; the one without a gradient has none.
         assert found["averaged"] == [ranks / SIZE, None, 10 * ranks / SIZE]
-        assert found["objects"] == (0, [("of", other) for other in range(SIZE)])
+        assert found["once"] == (0, 1), "process 0 computes as if it were the only one"
+        assert found["objects"] == [("of", other) for other in range(SIZE)]
 
 
 def normalised() -> dict[str, Any]:

@@ -35,13 +35,12 @@ from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.trainer import Scheme
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator
 from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import Loadable, Sample
+from rgbt.types import Sample
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.rare_classes import RareClasses
@@ -72,7 +71,7 @@ class TrainingSetup:
     others: dict[str, nn.Module]
     optimizers: dict[str, torch.optim.Optimizer]
     rare: RareClasses | None
-    scheme: Scheme
+    scheme: Any
     schedule: Schedule
     absent: tuple[str, ...]
 
@@ -101,7 +100,7 @@ class TrainingSetup:
             "predicted": _in_words({each.thermal.shape for each in tested}),
         }
 
-    def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
+    def batches(self, steps: range) -> Batches | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.drawn.order
         loading = session.loading

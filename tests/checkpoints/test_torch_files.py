@@ -23,8 +23,9 @@ from rgbt import evaluate
 from rgbt.checkpoints.files import read, save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import (
-    Checkpoints,
     State,
+    commit,
+    load_best,
     load_checkpoint,
     restore_optimizer,
     restore_weights,
@@ -187,11 +188,10 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     with pytest.raises(InputError, match=f"counts of the run {other.name}"):
         RunResult(folder).counts()
     state = State(seed=3, step=7, best_step=7, key="a", settings="b")
-    run = Checkpoints(tmp_path / "a")
-    run.commit(payload() | {"state": asdict(state)}, state)
-    assert run.load_best(state).keys() == payload()["model"].keys()
+    commit(tmp_path / "a", payload() | {"state": asdict(state)}, state)
+    assert load_best(tmp_path / "a", state).keys() == payload()["model"].keys()
     with pytest.raises(RunError, match="belongs to the run a, not to c"):
-        run.load_best(replace(state, key="c"))
+        load_best(tmp_path / "a", replace(state, key="c"))
 
 
 def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.data import loaders
 from rgbt.data.loaders import (
     Batches,
+    Examples,
     LoadedBatch,
     LoaderSettings,
     PairedBatches,
@@ -32,7 +33,6 @@ from rgbt.data.loaders import (
 from rgbt.data.mfnet import MFNet
 from rgbt.data.rare_classes import (
     RareClasses,
-    RareClassExamples,
     class_probabilities,
     count_rare_classes,
 )
@@ -61,11 +61,11 @@ def dataset(write_mfnet) -> MFNet:
 
 def trained(
     dataset: MFNet, steps: range, seed: int = 7, split: str = "train", **changes: object
-) -> Batches[Any]:
+) -> Batches:
     return train_batches(dataset, split, crm(), settings(**changes), seed, steps)
 
 
-def evaluated(dataset: MFNet, **changes: object) -> Batches[Batch]:
+def evaluated(dataset: MFNet, **changes: object) -> Batches:
     return eval_batches(dataset, "val", crm(test_short_edge=12), settings(**changes))
 
 
@@ -360,13 +360,9 @@ def test_crop_is_drawn_again_until_it_shows_enough(
         return SimpleNamespace(label=np.repeat(sample, next(left)))
 
     drawn, _ = rare.draw(numpy_generator(3, "rare class", 0, 5))
-    source: Any = SimpleNamespace(
-        names=list(PIXELS),
-        first_readable=lambda names, skipped: drawn,
-        transform=SimpleNamespace(train=make),
-        seed=3,
-    )
-    RareClassExamples(source, rare)((0, 5), {})
+    dataset: Any = SimpleNamespace(read=lambda name: drawn)
+    transform: Any = SimpleNamespace(train=make)
+    Examples(dataset, tuple(PIXELS), transform, False, 3, rare).train((0, 5), {})
     assert len(set(seen)) == len(seen) == calls
     # The draws of the augmentation are those of (seed, "augment", epoch, number) alone, and not
     # those that have chosen the class.
