@@ -137,7 +137,7 @@ def test_channels_last_differs_by_rounding_alone(name: str) -> None:
     plain = nano(name).double()
     net = place(copy.deepcopy(plain), CPU, settings(memory_format="channels_last"))
     rgb, thermal = (image.double() for image in images(2))
-    first, second = (each.train()(rgb, thermal, generator=generator()) for each in (plain, net))
+    first, second = (model.train()(rgb, thermal, generator=generator()) for model in (plain, net))
     torch.testing.assert_close(second.logits, first.logits, rtol=1e-9, atol=1e-11)
     assert any(
         parameter.is_contiguous(memory_format=torch.channels_last) and not parameter.is_contiguous()
