@@ -14,7 +14,7 @@ Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
 class AveragedNetwork(AveragedModel):
-    """A copy of a network whose weights are averaged over the steps; `module` is the copy.
+    """Averages the weights of a network over the steps, in a copy of it, `module`.
 
         w' <- w' + share (w - w')
 

@@ -16,7 +16,7 @@ import rgbt
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, >= 1; a container's quota of CPU time is not counted."""
+    """Count the cores that this process may use, >= 1; quotas of CPU time do not count."""
     if hasattr(os, "sched_getaffinity"):  # Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

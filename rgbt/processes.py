@@ -10,35 +10,37 @@ mean over the processes is the loss of the batch. A divisor that depends on the 
 samples, divided by W (`mean_count`). Where a loss is not linear in its sums, the sums are those of
 all samples (`total`).
 
-With one process, every function returns its argument. Within `alone`, so does process 0.
+With one process, every function returns its argument. What process 0 does for all of them, such as
+looking at files, is a function given to `computed_once`. Whether a process writes the files of the
+run is decided in one place, where it opens the run folder (`rgbt.training.train.train_run`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, distributed
+from torch import Tensor, distributed, nn
 
 Value = TypeVar("Value")
 
-_alone = False
+# Whether process 0 computes something for all (`computed_once`), as if it were the only process.
+_is_alone = False
 
 
 def num_processes() -> int:
-    """W, the number of processes of this run; 1 where it is not distributed."""
+    """Return W, the number of processes of this run; 1 where it is not distributed."""
     return distributed.get_world_size() if _is_distributed() else 1
 
 
 def rank() -> int:
-    """r, the number of this process, 0..W-1. Process 0 writes the files of the run."""
+    """Return r, the number of this process, 0..W-1."""
     return distributed.get_rank() if _is_distributed() else 0
 
 
 def own(whole: Tensor, dim: int = 0) -> Tensor:
-    """The part of this process: every W-th entry along `dim`, from the r-th on.
+    """Return the part of this process: every W-th entry along `dim`, from the r-th on.
 
     Args:
         whole: any dtype; entries along `dim` are the samples of all processes, or several stacked
@@ -51,7 +53,7 @@ def own(whole: Tensor, dim: int = 0) -> Tensor:
 
 
 def own_draw(draw: Callable[[int], Tensor], count: int, dim: int = 0) -> Tensor:
-    """The part of this process of what is drawn for all samples.
+    """Draw for the samples of all processes, and return the part of this process.
 
     Args:
         draw: number of samples -> the draws, with the samples along `dim`.
@@ -62,7 +64,7 @@ def own_draw(draw: Callable[[int], Tensor], count: int, dim: int = 0) -> Tensor:
 
 
 def whole(part: Tensor) -> Tensor:
-    """The parts of all processes in the order of the samples; the inverse of `own` along dim 0.
+    """Join the parts of all processes in the order of the samples: the inverse of `own`, dim 0.
 
     No gradient passes. All processes have as many samples: (n, ...) -> (n W, ...).
     """
@@ -75,7 +77,7 @@ def whole(part: Tensor) -> Tensor:
 
 
 def total(part: Tensor) -> Tensor:
-    """The sum over the processes, of the same shape; its gradient is the sum of their gradients.
+    """Sum over the processes, in the same shape; its gradient is the sum of their gradients.
 
     The gradients of parameters are then averaged over the processes, so that a loss that every
     process computes from such sums has the gradient of the loss of the batch.
@@ -87,7 +89,7 @@ def total(part: Tensor) -> Tensor:
 
 
 def mean_count(count: Tensor) -> Tensor:
-    """The sum over the processes, divided by their number; no gradient passes."""
+    """Return the sum over the processes, divided by their number; no gradient passes."""
     if num_processes() == 1:
         return count
     summed = count.detach().float().clone()
@@ -95,8 +97,35 @@ def mean_count(count: Tensor) -> Tensor:
     return summed / num_processes()
 
 
+@torch.no_grad()
+def average_gradients(parameters: Sequence[nn.Parameter]) -> None:
+    """Replace each gradient by its mean over the processes, after the last pass of a phase.
+
+    A step may have several forward passes, heads that one domain alone uses, and parameters that
+    two optimizers step, unlike in DistributedDataParallel. What a parameter kept from an earlier
+    phase is the mean already. No gradient is 0 where another process has one.
+    """
+    if num_processes() == 1:
+        return
+    used = mean_count(torch.tensor([parameter.grad is not None for parameter in parameters]))
+    by_dtype: dict[torch.dtype, list[Tensor]] = {}
+    for parameter, share in zip(parameters, used.tolist(), strict=True):
+        if not share:
+            continue
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        by_dtype.setdefault(parameter.dtype, []).append(parameter.grad)
+    for gradients in by_dtype.values():
+        flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+        distributed.all_reduce(flat)
+        flat /= num_processes()
+        parts = torch.split(flat, [gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
+            gradient.copy_(part.view(gradient.shape))
+
+
 def largest(number: int) -> int:
-    """The largest of the numbers of all processes."""
+    """Return the largest of the numbers of all processes."""
     if num_processes() == 1:
         return number
     found = torch.tensor(number)
@@ -104,17 +133,29 @@ def largest(number: int) -> int:
     return int(found)
 
 
-def agreed(value: Value) -> Value:
-    """The value of process 0, of any type that can be pickled."""
+def computed_once(compute: Callable[[], Value]) -> Value:
+    """Return to every process what process 0 computes as if it were the only one; the others wait.
+
+    The value is of any type that can be pickled. An error of `compute` is raised in process 0
+    alone; torchrun or srun end the others.
+    """
+    global _is_alone
     if num_processes() == 1:
-        return value
-    values = [value]
+        return compute()
+    values: list[Any] = [None]
+    if rank() == 0:
+        _is_alone = True
+        try:
+            values = [compute()]
+        finally:
+            _is_alone = False
     distributed.broadcast_object_list(values, src=0)
-    return values[0]
+    found: Value = values[0]
+    return found
 
 
 def collected(value: Value) -> list[Value]:
-    """The values of all processes, process by process."""
+    """Return the values of all processes, process by process."""
     if num_processes() == 1:
         return [value]
     values: list[Any] = [None] * num_processes()
@@ -122,19 +163,8 @@ def collected(value: Value) -> list[Value]:
     return values
 
 
-@contextmanager
-def alone() -> Iterator[None]:
-    """A context in which this process works as if it were the only one; the others wait."""
-    global _alone
-    before, _alone = _alone, True
-    try:
-        yield
-    finally:
-        _alone = before
-
-
 def _is_distributed() -> bool:
-    return not _alone and distributed.is_available() and distributed.is_initialized()
+    return not _is_alone and distributed.is_available() and distributed.is_initialized()
 
 
 class _Total(torch.autograd.Function):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def derive(seed: int, purpose: str, *index: int) -> int:
-    """63-bit seed that depends on every argument (SHA-256), the same on every machine.
+    """Derive a 63-bit seed from every argument (SHA-256), the same on every machine.
 
     Args:
         seed: run seed, any integer; 0 is a seed.
@@ -32,7 +32,7 @@ def derive(seed: int, purpose: str, *index: int) -> int:
 def torch_generator(
     seed: int, purpose: str, *index: int, device: torch.device | str = "cpu"
 ) -> torch.Generator:
-    """A torch generator on `device`, seeded by `derive`."""
+    """Make a torch generator on `device`, seeded by `derive`."""
     import torch  # not at the top: data sets are read without it
 
     return torch.Generator(device=device).manual_seed(derive(seed, purpose, *index))
@@ -41,10 +41,10 @@ def torch_generator(
 def generators_of_step(
     seed: int, step: int, device: torch.device
 ) -> Callable[[str], torch.Generator]:
-    """Purpose -> generator of one step (see `rgbt.types.GeneratorOf`)."""
+    """Return a function that makes the generators of one step (`rgbt.types.GeneratorOf`)."""
     return lambda purpose: torch_generator(seed, purpose, step, device=device)
 
 
 def numpy_generator(seed: int, purpose: str, *index: int) -> np.random.Generator:
-    """A NumPy generator (PCG64), seeded by `derive`."""
+    """Make a NumPy generator (PCG64), seeded by `derive`."""
     return np.random.default_rng(derive(seed, purpose, *index))

@@ -107,7 +107,7 @@ class Batch:
     confidence: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Batch:
-        """The batch on `device`, with images as float32 in [0, 1]."""
+        """Move the batch to `device`, with images as float32 in [0, 1]."""
 
         def moved(tensor: Tensor) -> Tensor:
             return tensor.to(device, non_blocking=True)
@@ -124,19 +124,6 @@ class Batch:
         )
 
 
-class Loadable(Protocol):
-    """An item of a loader: a batch, or examples that become a batch on the device."""
-
-    @property
-    def name(self) -> tuple[str, ...]:
-        """B names."""
-        ...
-
-    def to(self, device: torch.device | str) -> Batch:
-        """The batch on `device`, with images as float32 in [0, 1]."""
-        ...
-
-
 @dataclass(frozen=True)
 class TwoDomains:
     """The input of one step of domain adaptation: a batch of each domain, drawn independently.
@@ -150,6 +137,15 @@ class TwoDomains:
     source: Batch
     target: Batch
     step: int
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """Names of all samples, those of the source first."""
+        return self.source.name + self.target.name
+
+    def to(self, device: torch.device | str) -> TwoDomains:
+        """Move both batches to `device` (see `Batch.to`)."""
+        return TwoDomains(self.source.to(device), self.target.to(device), self.step)
 
 
 class SceneMaps(NamedTuple):
@@ -226,7 +222,7 @@ class AnyMasker(Protocol):
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> MaskPair:
-        """Cells of a crop of `image_hw` pixels, padded; one draw per row of `centre_yx`."""
+        """Draw cells of a crop of `image_hw` pixels, padded, for each row of `centre_yx`."""
         ...
 
 
@@ -236,5 +232,5 @@ class Loss(Protocol):
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Named, weighted parts, each of shape (P,): one value per stacked pass of the batch."""
+        """Return named, weighted parts of shape (P,): one value per stacked pass of the batch."""
         ...

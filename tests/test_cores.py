@@ -99,8 +99,12 @@ while executor.state(job) == "running":
 def test_torch_is_imported_after_rgbt(package: str) -> None:
     """Imports are sorted, so that one of torch at the top of a module comes before ours."""
     for path in (ROOT / package).rglob("*.py"):
-        tops = [each for each in ast.parse(path.read_text()).body if isinstance(each, ast.Import)]
-        assert "torch" not in {alias.name for each in tops for alias in each.names}, path
+        tops = [
+            statement
+            for statement in ast.parse(path.read_text()).body
+            if isinstance(statement, ast.Import)
+        ]
+        assert "torch" not in {alias.name for statement in tops for alias in statement.names}, path
 
 
 def test_usable_cores_are_those_that_the_process_may_use() -> None:

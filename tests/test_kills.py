@@ -134,16 +134,16 @@ def comparable(path: Path) -> dict[str, Any]:
 def check(bench: Bench, place: Path) -> None:
     """The run in `place` is as the undisturbed one, and nothing else is left."""
     folder, straight = only_run(place), bench.undisturbed
-    result, expected = (RunResult(each).result for each in (folder, straight))
+    result, expected = (RunResult(run).result for run in (folder, straight))
     for one in (result, expected):
         del one["seconds_of_last_process"], one["name"]  # the name says how many workers
     assert result == expected
     assert lines(folder) == lines(straight)
     for name in ("best.pt", "last.pt"):
-        assert same(*(comparable(each / name) for each in (folder, straight))), name
+        assert same(*(comparable(run / name) for run in (folder, straight))), name
     assert load_checkpoint(folder / "best.pt")["step"] == result["best_step"]
     for split in ("val", "test"):
-        one, other = (RunResult(each).counts(split).counts for each in (folder, straight))
+        one, other = (RunResult(run).counts(split).counts for run in (folder, straight))
         assert np.array_equal(one, other)
     assert files(folder) == files(straight)
     store = MlflowClient(tracking_uri=f"sqlite:///{bench.root / 'mlflow.db'}")

@@ -26,7 +26,6 @@ from rgbt.engine.batch_norm import (
     share_running_statistics,
     synchronise_batch_norm,
 )
-from rgbt.engine.trainer import average_gradients
 from tests.conftest import WriteMFNet
 from tests.models.plain import generator
 from tests.processes import run_in_processes
@@ -66,24 +65,27 @@ def sharing() -> dict[str, Any]:
         "own": (processes.own(entries), processes.own(entries, 1)),
         "own_draw": processes.own_draw(lambda n: torch.arange(n), B // size),
         "whole": [
-            torch.equal(processes.whole(processes.own(each)), each)
-            for each in (entries, entries > 5, layout)
+            torch.equal(processes.whole(processes.own(tensor)), tensor)
+            for tensor in (entries, entries > 5, layout)
         ],
         "sums": (total.detach(), part.grad, processes.total(torch.tensor(rank))),
         "mean_count": processes.mean_count(torch.tensor(3 * rank)),
         "largest": processes.largest(5 - rank),
         "averaged": averaged(),
-        "objects": (processes.agreed(rank), processes.collected(("of", rank))),
+        "once": processes.computed_once(lambda: (rank, processes.num_processes())),
+        "objects": processes.collected(("of", rank)),
     }
 
 
 def averaged() -> list[float | None]:
-    """Gradients of three parameters after `average_gradients`."""
-    parameters = [nn.Parameter(torch.zeros(2, dtype=each)) for each in DTYPES]
+    """Gradients of three parameters after `processes.average_gradients`."""
+    parameters = [nn.Parameter(torch.zeros(2, dtype=dtype)) for dtype in DTYPES]
     for factor, parameter in zip((1, 0, 10), parameters, strict=True):
         parameter.grad = torch.full_like(parameter, factor * processes.rank()) if factor else None
-    average_gradients(parameters)
-    return [None if each.grad is None else float(each.grad[1]) for each in parameters]
+    processes.average_gradients(parameters)
+    return [
+        None if parameter.grad is None else float(parameter.grad[1]) for parameter in parameters
+    ]
 
 
 @pytest.mark.slow
@@ -103,7 +105,8 @@ def test_parts_wholes_and_sums() -> None:
         assert found["largest"] == 5
         # Of each parameter the mean of rank and of 10 rank; the one without a gradient has none.
         assert found["averaged"] == [ranks / SIZE, None, 10 * ranks / SIZE]
-        assert found["objects"] == (0, [("of", other) for other in range(SIZE)])
+        assert found["once"] == (0, 1), "process 0 computes as if it were the only one"
+        assert found["objects"] == [("of", other) for other in range(SIZE)]
 
 
 def normalised() -> dict[str, Any]:
@@ -122,24 +125,24 @@ def normalised() -> dict[str, Any]:
     made = synchronise_batch_norm(net)
     images = [5 + torch.randn(B, 3, 5, 6, generator=generator(n)).double() for n in (1, 2)]
     weight = torch.randn(B, 3, 12, generator=generator(3)).double()
-    outputs = [made(processes.own(each)) for each in images]
-    for each in outputs:
-        (each * processes.own(weight)).mean().backward()
+    outputs = [made(processes.own(batch)) for batch in images]
+    for output in outputs:
+        (output * processes.own(weight)).mean().backward()
     gradients = [processes.total(p.grad) / processes.num_processes() for p in made.parameters()]
-    statistics = {name: each.clone() for name, each in made.named_buffers()}
+    statistics = {name: buffer.clone() for name, buffer in made.named_buffers()}
     # Without the last one, which has no statistics to evaluate with.
     evaluated = made.eval()[:-1](processes.own(images[0])).detach()
-    for each in made.buffers():  # as if every process had statistics of its own
-        each.fill_(processes.rank() + 1)
+    for buffer in made.buffers():  # as if every process had statistics of its own
+        buffer.fill_(processes.rank() + 1)
     share_running_statistics(made)
     return {
-        "outputs": [each.detach() for each in outputs],
+        "outputs": [output.detach() for output in outputs],
         "gradients": gradients,
         "statistics": statistics,
         "evaluated": evaluated,
-        "replaced": sum(isinstance(each, SynchronisedBatchNorm) for each in made),
+        "replaced": sum(isinstance(layer, SynchronisedBatchNorm) for layer in made),
         "same": names == list(made.state_dict()),
-        "shared": [each.unique().tolist() for each in made.buffers()],
+        "shared": [buffer.unique().tolist() for buffer in made.buffers()],
     }
 
 
@@ -190,7 +193,7 @@ def loaded(root: Path) -> dict[str, Any]:
     train = [train_batches(dataset, "train", crm(), given, seed, range(1, 5)) for seed in (3, 4)]
     pairs = PairedBatches(*train, first=1, per_step=1)
     return {
-        "train": [batch for each in pairs for batch in (each.source, each.target)],
+        "train": [batch for pair in pairs for batch in (pair.source, pair.target)],
         "eval": [batch.name for batch in eval_batches(dataset, "val", crm(), given)],
         "uneven": is_refused(lambda: train_batches(dataset, "train", crm(), uneven, 0, range(1))),
     }

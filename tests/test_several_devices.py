@@ -94,7 +94,7 @@ def assert_same_run(folder: Path, other: Path) -> None:
         assert values["loss"] == pytest.approx(expected["loss"], rel=1e-5), step
         assert values == pytest.approx(expected, rel=1e-4, abs=1e-6), step
     for split in ("val", "test"):
-        one, two = (Counts.load(each / f"counts_{split}.npz") for each in (folder, other))
+        one, two = (Counts.load(run / f"counts_{split}.npz") for run in (folder, other))
         assert one.names == two.names
         differing = np.abs(one.counts.astype(int) - two.counts).sum() / 2
         assert differing <= 1e-3 * two.counts.sum(), split

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from reference_pages.markdown import code, page, table
-from rgbt.checkpoints.starts import RECIPES, STARTS, Recipe
+from rgbt.checkpoints.starts import RECIPES, STARTS, SameStart
 from rgbt.config.compose import available
 
 
@@ -17,7 +17,7 @@ def weights_page() -> str:
         "dataset.root=/data/MFNet \\\n  pretrained=swin_small_patch4_window7_224.pth\n```",
         "`pretrained` initialises the network of the run, or that of its first upstream run.",
         "## Files by recipe",
-        table(["Recipes", "Networks", "Files", "Source"], [_recipe(each) for each in RECIPES]),
+        table(["Recipes", "Networks", "Files", "Source"], [_recipe(recipe) for recipe in RECIPES]),
         "## Files",
         "A digest is the beginning of the SHA-256, where it is known. `rgbt weights inspect FILE` "
         "prints the SHA-256 of your file, the recipes of a published file, and a remark where a "
@@ -48,7 +48,7 @@ def weights_page() -> str:
     )
 
 
-def _recipe(recipe: Recipe) -> list[str]:
+def _recipe(recipe: SameStart) -> list[str]:
     names = recipe.named(available("experiment"))
     files = ", ".join(map(code, recipe.files)) or "none: random values"
     return [", ".join(map(code, names)), code(f"{recipe.model}*"), files, recipe.source]

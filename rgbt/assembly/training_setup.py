@@ -29,7 +29,6 @@ from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.trainer import Scheme
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator
 from rgbt.requirements import (
@@ -42,7 +41,7 @@ from rgbt.requirements import (
 )
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import Loadable, Sample
+from rgbt.types import Sample
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.rare_classes import RareClasses
@@ -73,7 +72,7 @@ class TrainingSetup:
     others: dict[str, nn.Module]
     optimizers: dict[str, torch.optim.Optimizer]
     rare: RareClasses | None
-    scheme: Scheme
+    scheme: Any
     schedule: Schedule
     absent: tuple[str, ...]
 
@@ -102,7 +101,7 @@ class TrainingSetup:
             "predicted": _in_words({example.thermal.shape for example in tested}),
         }
 
-    def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
+    def batches(self, steps: range) -> Batches | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.drawn.order
         loading = session.loading

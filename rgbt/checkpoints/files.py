@@ -132,7 +132,7 @@ class Contents:
 
 
 def read(path: Path) -> Contents:
-    """Names and tensors of a file of torch.save or of safetensors.
+    """Read names and tensors of a file of torch.save or of safetensors.
 
     Raises:
         InputError: missing, damaged, of another kind, or it would execute code.
@@ -148,7 +148,7 @@ def read(path: Path) -> Contents:
 
 
 def read_torch_file(path: Path, *, mapped: bool = False) -> Any:
-    """The value of a file of torch.save, tensors on the CPU; errors as of `read`.
+    """Read the value of a file of torch.save, tensors on the CPU; errors as of `read`.
 
     Where `mapped`, tensors may stay in the file; writing to them does not reach it.
     """
@@ -244,14 +244,17 @@ def _unwrapped(path: Path, value: Any) -> Contents:
     if len(inner) > 1:
         raise InputError(f"{path} holds weights under {inner}; keep one of them in the file.")
     state = value[inner[0]] if inner else value
-    note = value.get(NOTE) if inner else None
-    texts = note.items() if isinstance(note, dict) else ()
+    found = value.get(NOTE) if inner else None
+    note = {}
+    for key, text in found.items() if isinstance(found, dict) else ():
+        if type(key) is str and type(text) is str:
+            note[key] = text
     return Contents(
         path,
-        _without_prefixes({name: each for name, each in state.items() if isinstance(each, Tensor)}),
+        _without_prefixes({k: value for k, value in state.items() if isinstance(value, Tensor)}),
         settings=dict(_settings(value)) if inner else {},
         ours=value.keys() - {NOTE} in OURS,
-        note={key: text for key, text in texts if type(key) is str and type(text) is str},
+        note=note,
     )
 
 
@@ -259,16 +262,17 @@ def _is_state(value: object) -> bool:
     """Whether a dictionary is tensors by name."""
     return (
         isinstance(value, dict)
-        and any(isinstance(each, Tensor) for each in value.values())
+        and any(isinstance(entry, Tensor) for entry in value.values())
         and all(type(key) is str for key in value)
     )
 
 
 def _without_prefixes(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    while found := next((p for p in PREFIXES if all(n.startswith(p) for n in tensors)), None):
-        if not tensors or found in tensors:
-            break
-        tensors = {name.removeprefix(found): tensor for name, tensor in tensors.items()}
+    """Take the `PREFIXES` off that all names have."""
+    for prefix in PREFIXES:
+        if tensors and prefix not in tensors and all(name.startswith(prefix) for name in tensors):
+            shorter = {name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
+            return _without_prefixes(shorter)
     return tensors
 
 
@@ -299,7 +303,7 @@ def is_plain(value: object) -> bool:
 
 
 def misfits(own: Mapping[str, Tensor], stored: Mapping[str, Any]) -> list[str]:
-    """What keeps `stored` tensors of a checkpoint from the places of a network, in words.
+    """List in words what keeps `stored` tensors of a checkpoint from the places of a network.
 
     torch itself compares no types.
     """
@@ -313,7 +317,7 @@ def misfits(own: Mapping[str, Tensor], stored: Mapping[str, Any]) -> list[str]:
 
 
 def in_words(value: object) -> str:
-    """Shape and type: "9x32 float32"."""
+    """Write shape and type: "9x32 float32"."""
     if not isinstance(value, Tensor):
         return f"a {type(value).__name__}"
     size = "x".join(map(str, value.shape)) or "one"

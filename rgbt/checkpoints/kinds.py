@@ -51,7 +51,7 @@ class Kind:
 
 
 def renaming(*names: tuple[str, str]) -> Callable[[str], str]:
-    """A function that replaces pairs (regular expression, replacement) in turn in a name."""
+    """Return a function that replaces pairs (regular expression, replacement) in turn in a name."""
 
     def renamed(name: str) -> str:
         for pattern, replacement in names:
@@ -269,11 +269,15 @@ OWN = Kind("file of rgbt")
 
 
 def family_of(network: type[nn.Module]) -> str:
-    """The module of rgbt.models that a class or a base of it is from, "" for all others."""
-    return next(filter(None, (family_named(each.__module__) for each in network.__mro__)), "")
+    """Return the module of rgbt.models that a class or a base of it is from, "" for all others."""
+    for base in network.__mro__:
+        family = family_named(base.__module__)
+        if family:
+            return family
+    return ""
 
 
 def family_named(path: str) -> str:
-    """The same for a dotted path: "cmx" for "rgbt.models.cmx.model.CMX"."""
+    """Return the same for a dotted path: "cmx" for "rgbt.models.cmx.model.CMX"."""
     words = path.split(".")
     return words[2] if words[:2] == ["rgbt", "models"] and len(words) > 2 else ""

@@ -52,16 +52,18 @@ class Plan:
 
     @property
     def convention(self) -> tuple[str, ...]:
-        """Overrides for the inputs and the evaluation that the weights were trained for."""
+        """Return overrides for the inputs and evaluation that the weights were trained for."""
         if self.contents.note:
             return ()
-        settings = self.contents.settings.items()
-        fusion = [value for key, value in settings if key.endswith("FUSION.AGGREGATION")]
-        return (*self.kind.convention, *(f"model.fusion={str(each).lower()}" for each in fusion))
+        overrides = list(self.kind.convention)
+        for key, value in self.contents.settings.items():
+            if key.endswith("FUSION.AGGREGATION"):
+                overrides.append(f"model.fusion={str(value).lower()}")
+        return tuple(overrides)
 
     @property
     def inputs(self) -> Mapping[str, object] | None:
-        """`model.inputs` as an export notes it, None where it does not."""
+        """Read `model.inputs` as an export notes it, None where it does not."""
         try:
             noted = json.loads(self.contents.note.get("inputs", ""))
         except json.JSONDecodeError:
@@ -69,7 +71,7 @@ class Plan:
         return noted if isinstance(noted, dict) else None
 
     def sentence(self) -> str:
-        """What is set, in one line, or why the file does not fit."""
+        """Say what is set, in one line, or why the file does not fit."""
         where = f"{self.contents.path} ({self.kind.title})"
         if self.problems:
             return (
@@ -174,13 +176,18 @@ def plan_for(
 
 
 def recognised(contents: Contents) -> str:
-    """What a file is, in words; "" for an unknown one."""
-    kinds = (OWN,) if contents.ours else (each for kinds in KINDS.values() for each in kinds)
-    return next((each.title for each in kinds if each.recognises(contents.tensors)), "")
+    """Say what a file is; "" for an unknown one."""
+    if contents.ours:
+        return OWN.title
+    for of_family in KINDS.values():
+        for kind in of_family:
+            if kind.recognises(contents.tensors):
+                return kind.title
+    return ""
 
 
 def _kind_of(model: nn.Module, contents: Contents) -> Kind:
-    """The first kind of the network's family that recognises the file."""
+    """Find the first kind of the network's family that recognises the file."""
     if contents.ours:
         return OWN
     state, family = model.state_dict(), family_of(type(model))
@@ -193,7 +200,7 @@ def _kind_of(model: nn.Module, contents: Contents) -> Kind:
     if names := record_of(model, NetworkRecord).author_names:
         beginning, prefix = names
         return Kind(
-            "of its author", prefix=prefix, source=lambda each: each.removeprefix(beginning)
+            "of its author", prefix=prefix, source=lambda entry: entry.removeprefix(beginning)
         )
     what = recognised(contents) or f"with names such as {_some(list(contents.tensors))}"
     raise InputError(
@@ -203,7 +210,7 @@ def _kind_of(model: nn.Module, contents: Contents) -> Kind:
 
 
 def _as_stem(tensor: Tensor, place: Tensor) -> Tensor:
-    """A first convolution (C, 3, k, k) for images of one or four channels, others as they are.
+    """Convert a first convolution (C, 3, k, k) to one or four channels; others stay.
 
     One channel gets the mean over the file's three; a fourth one behind these gets it too.
     """
@@ -215,7 +222,7 @@ def _as_stem(tensor: Tensor, place: Tensor) -> Tensor:
 
 
 def _torn(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> Iterator[str]:
-    """Entries that share one parameter but would get different values."""
+    """Yield entries that share one parameter but would get different values."""
     shared: dict[int, str] = {}
     for other, value in values.items():
         first = shared.setdefault(id(state[other]), other)
@@ -228,6 +235,6 @@ def _under(entry: str, parts: tuple[str, ...]) -> bool:
 
 
 def _some(names: Sequence[str], separator: str = ", ") -> str:
-    """The first names of a list."""
+    """Write the first names of a list."""
     shown = separator.join(one_line(name) for name in names[:3])
     return shown + f"{separator}and {len(names) - 3} more" * (len(names) > 3)

@@ -39,7 +39,7 @@ NO_OBJECT = 0.1
 
 
 def convention_of(layout: str, family: str) -> tuple[str, ...]:
-    """How the authors' code feeds and evaluates the network that a file of a layout is for."""
+    """Return how the authors' code feeds and evaluates the network that a layout is for."""
     if layout == "safetensors" or not KINDS.get(family):
         return ()
     fusion = ("model.fusion=max",) if family == "mask2former" else ()
@@ -66,12 +66,14 @@ def save(path: Path, layout: str, family: str, state: Mapping[str, Tensor], note
 
 
 def released(family: str, state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
-    """What torch.save writes for the authors' code; arguments and errors as of `save`."""
+    """Arrange what torch.save writes for the authors' code; arguments and errors as of `save`."""
     if family not in RELEASES:
         what = family or "this network"
         raise InputError(f"format=released does not exist for {what}; use format=safetensors.")
     wrapper, prefix = RELEASES[family]
-    named = OrderedDict((prefix + _released_name(family, key), each) for key, each in state.items())
+    named = OrderedDict()
+    for key, value in state.items():
+        named[prefix + _released_name(family, key)] = value
     if family == "mask2former":
         for key, value in state.items():
             if key.endswith("relative_position_bias_table"):
@@ -92,9 +94,10 @@ def _released_name(family: str, entry: str) -> str:
 
 
 def position_index(rows: int) -> Tensor:
-    """Row of Swin's bias table, of (2 w - 1)^2 rows, for every pair of tokens of a window.
+    """Compute the row of Swin's bias table, of (2 w - 1)^2 rows, for every pair of tokens.
 
-    (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
+    (w^2, w^2) int64 of a window of w x w:
+    (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
     """
     span = round(rows**0.5)
     side = (span + 1) // 2

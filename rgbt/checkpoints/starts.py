@@ -24,7 +24,7 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class SameStart:
     """Experiments that start from the same files; the attributes are those of ``starts.yaml``."""
 
     experiments: tuple[str, ...]
@@ -33,18 +33,23 @@ class Recipe:
     source: str
 
     def named(self, experiments: Collection[str]) -> tuple[str, ...]:
-        """Those of `experiments` that are meant."""
-        patterns = self.experiments
-        return tuple(n for n in experiments if any(fnmatchcase(n, each) for each in patterns))
+        """Return those of all `experiments` that a pattern of this row names."""
+        named = []
+        for experiment in experiments:
+            if any(fnmatchcase(experiment, pattern) for pattern in self.experiments):
+                named.append(experiment)
+        return tuple(named)
 
 
 _TABLE = read_yaml(Path(__file__).with_name("starts.yaml"))
 STARTS: tuple[Start, ...] = TypeAdapter(tuple[Start, ...]).validate_python(_TABLE["files"])
-RECIPES: tuple[Recipe, ...] = TypeAdapter(tuple[Recipe, ...]).validate_python(_TABLE["recipes"])
+RECIPES: tuple[SameStart, ...] = TypeAdapter(tuple[SameStart, ...]).validate_python(
+    _TABLE["recipes"]
+)
 
 
 def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Which published file a file is, and what starts from it, as lines of (word, text).
+    """Say which published file a file is, and what starts from it, as lines of (word, text).
 
     `digest` is its SHA-256 in hexadecimal; `experiments` are the names of all of them.
     """

@@ -44,11 +44,12 @@ class Domain:
             )
 
     def requires(self, key: str) -> Iterator[Requirement]:
-        """The requirements that follow from the settings of the domain at `key`."""
-        for each, value in (("view", self.view), ("head", self.head)):
+        """Yield the requirements that follow from the settings of the domain at `key`."""
+        for name, value in (("view", self.view), ("head", self.head)):
             if value is not None:
-                yield Requirement("scheme", "shows_views", True, f"{key}.{each}={value}")
-                yield Requirement("model", f"{each}s", (value,), f"{key}.{each}={value}")
+                setting = f"{key}.{name}={value}"
+                yield Requirement("scheme", "shows_views", True, setting)
+                yield Requirement("model", f"{name}s", (value,), setting)
         if self.teacher_view is not None:
             setting = f"{key}.teacher_view={self.teacher_view}"
             yield Requirement(f"network of {key}.labels", "views", (self.teacher_view,), setting)
@@ -95,14 +96,14 @@ class Domains:
 
     @property
     def record(self) -> DomainsRecord:
-        """What the domains provide, and what they require of other components."""
-        of_two = Requirement("scheme", "num_domains", 2)
-        named = self.named.items()
+        """State what the domains provide, and what they require of other components."""
+        requires: list[Requirement] = []
+        if self.target is not None:
+            requires.append(Requirement("scheme", "num_domains", 2))
+        for name, domain in self.named.items():
+            requires += domain.requires(f"domains.{name}")
         return DomainsRecord(
-            requires=(
-                *((of_two,) if self.target is not None else ()),
-                *(each for name, domain in named for each in domain.requires(f"domains.{name}")),
-            ),
+            requires=tuple(requires),
             num_domains=1 if self.target is None else 2,
             heads=self.heads,
             separate_heads=len(self.heads) > 1,
@@ -112,18 +113,18 @@ class Domains:
 
     @cached_property
     def named(self) -> dict[str, Domain]:
-        """The domains by name: "source" and, where there is one, "target"."""
+        """Return the domains by name: "source" and, where there is one, "target"."""
         both = {"source": self.source, "target": self.target}
         return {name: domain for name, domain in both.items() if domain is not None}
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Names of the heads, the source's first; () if the network has one for all."""
+        """Return the names of the heads, the source's first; () if there is one for all."""
         heads = (domain.head for domain in self.named.values())
         return tuple(dict.fromkeys(head for head in heads if head is not None))
 
     def heads_in_words(self, choice: TestedHead) -> str:
-        """Which head predicts which images, for messages; "" if there is one for all."""
+        """Say which head predicts which images, for messages; "" if there is one for all."""
         if len(self.heads) < 2:
             return ""
         source, target = self.heads
@@ -134,7 +135,7 @@ class Domains:
         return f"{target} for {self.named['target'].view}, {source} otherwise"
 
     def head_of(self, view: View, night: bool | None, choice: TestedHead) -> str | None:
-        """Name of the head that predicts an image; None if the network has one head for all.
+        """Return the head that predicts an image; None if the network has one head for all.
 
         Args:
             view: the images that the network gets.

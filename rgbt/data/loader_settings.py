@@ -15,7 +15,7 @@ LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "cache")
 
 @dataclass(frozen=True)
 class LoaderSettings:
-    """How samples are loaded; conf/config.yaml describes each setting.
+    """Says how samples are loaded; conf/config.yaml describes each setting.
 
     The samples of a batch are shared equally by all devices. `sampling`: the images of a target
     domain are always shuffled. `min_crop_ratio`: DAFormer 0.5, HRDA and MIC 2; 0: never again.

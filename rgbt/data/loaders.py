@@ -14,9 +14,9 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, cast
 
 import cv2
 import numpy as np
@@ -27,13 +27,11 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from rgbt.checks import InputError, RunError, without_controls
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
+from rgbt.data.rare_classes import RareClasses, crop_showing
 from rgbt.dataset import LabelledDataset
 from rgbt.processes import num_processes, rank
 from rgbt.randomness import numpy_generator
-from rgbt.types import Batch, Example, Loadable, Sample, TwoDomains
-
-if TYPE_CHECKING:
-    from rgbt.data.rare_classes import RareClasses
+from rgbt.types import Batch, Example, Sample, TwoDomains
 
 LOG = logging.getLogger(__name__)
 
@@ -47,7 +45,6 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Interval at which a worker checks that its main process exists.
 LOOK_S = 2.0
 
-Kind = TypeVar("Kind", bound=Loadable)
 # (key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`.
 MakeExample = Callable[[Any, dict[str, str]], Any]
 
@@ -56,17 +53,20 @@ class Transform(Protocol):
     """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example; every draw comes from `rng`."""
+        """Make an augmented example; every draw comes from `rng`."""
 
     def test(self, sample: Sample) -> Example:
-        """Example for evaluation, the same every time."""
+        """Make an example for evaluation, the same every time."""
 
 
 @dataclass(frozen=True)
 class Examples:
     """Reads and transforms the samples `names` of one split.
 
-    `skip_errors`: unreadable samples are recorded instead of raised. `seed`: of the run.
+    Attributes:
+        skip_errors: unreadable samples are recorded instead of raised.
+        seed: of the run.
+        rare: how training samples are drawn by class; None: those of their position in the split.
     """
 
     dataset: LabelledDataset
@@ -74,9 +74,10 @@ class Examples:
     transform: Transform
     skip_errors: bool
     seed: int = 0
+    rare: RareClasses | None = None
 
     def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
-        """The sample; None, with the reason in `skipped`, if it is skipped."""
+        """Read the sample; None, with the reason in `skipped`, if it is skipped."""
         try:
             return self.dataset.read(name)
         except InputError as error:
@@ -86,7 +87,7 @@ class Examples:
             return None
 
     def first_readable(self, names: Sequence[str], skipped: dict[str, str]) -> Sample:
-        """The first of these samples that can be read; InputError if there is none."""
+        """Read the first of these samples that can be read; InputError if there is none."""
         for name in names:
             sample = self.read(name, skipped)
             if sample is not None:
@@ -97,13 +98,25 @@ class Examples:
         )
 
     def train(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
-        """The augmented example of (epoch, index in the split), or of the next readable sample."""
+        """Augment the sample of (epoch, index in the split), or the next readable one.
+
+        With `rare`, the index is the number of a sample in its epoch: the example is of the image
+        drawn for it, or of the next readable one of the same class.
+        """
         epoch, index = key
-        sample = self.first_readable((*self.names[index:], *self.names[:index]), skipped)
-        return self.transform.train(sample, numpy_generator(self.seed, "augment", epoch, index))
+        rng = numpy_generator(self.seed, "augment", epoch, index)
+        if self.rare is None:
+            names = (*self.names[index:], *self.names[:index])
+            return self.transform.train(self.first_readable(names, skipped), rng)
+        draws = numpy_generator(self.seed, "rare class", epoch, index)
+        drawn, positions = self.rare.draw(draws)
+        sample = self.first_readable([self.names[position] for position in positions], skipped)
+        return crop_showing(
+            drawn, self.rare.min_crop_pixels, lambda: self.transform.train(sample, rng)
+        )
 
     def test(self, key: str, skipped: dict[str, str]) -> Example | None:
-        """The example of a name for evaluation, or None if it cannot be read."""
+        """Make the example of a name for evaluation, or None if it cannot be read."""
         sample = self.read(key, skipped)
         return None if sample is None else self.transform.test(sample)
 
@@ -145,19 +158,20 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """The result of a worker: a batch, or None if every sample was left out, or after an error.
+    """Carries the result of a worker: a batch, or None without samples or after an error.
 
     `skipped`: name -> error. `error`: message of an InputError, because torch wraps exceptions.
     """
 
-    batch: Loadable | None = None
+    batch: Batch | None = None
     skipped: dict[str, str] = field(default_factory=dict)
     error: str = ""
 
     def pin_memory(self) -> LoadedBatch:
-        """The batch in pinned memory; called by a thread of the loader."""
-        pin = torch.Tensor.pin_memory
-        return self if self.batch is None else replace(self, batch=_each(self.batch, pin))
+        """Move the batch to pinned memory; called by a thread of the loader."""
+        if self.batch is None:
+            return self
+        return replace(self, batch=_changed(self.batch, torch.Tensor.pin_memory))
 
 
 @dataclass
@@ -168,21 +182,21 @@ class BatchReader(Dataset[LoadedBatch]):
     advice: str
 
     def __getitem__(self, keys: list[Any]) -> LoadedBatch:
-        """The batch of `keys`, without the samples that are left out."""
+        """Make the batch of `keys`, without the samples that are left out."""
         skipped: dict[str, str] = {}
         try:
             found = [self.make_example(key, skipped) for key in keys]
             examples = [example for example in found if example is not None]
             batch = collate(examples, self.advice) if examples else None
             if batch is not None and get_worker_info() is not None:
-                batch = _each(batch, _shared)
+                batch = _changed(batch, _shared)
         except InputError as error:
             return LoadedBatch(skipped=skipped, error=str(error))
         return LoadedBatch(batch, skipped)
 
 
-class Batches(Iterator[Kind]):
-    """Batches in order, each made by `reader` of a list of `keys`.
+class Batches(Iterator[Batch]):
+    """Loads batches in order, one by `reader` for every list of `keys`.
 
     Attributes:
         skipped: name -> error, of the samples skipped so far.
@@ -213,8 +227,8 @@ class Batches(Iterator[Kind]):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def __next__(self) -> Kind:
-        """The next batch that holds at least one sample.
+    def __next__(self) -> Batch:
+        """Return the next batch that holds at least one sample.
 
         InputError: a file cannot be read (on_error="raise"), sizes differ within the batch, or
         there is no shared memory left. RunError: a worker process died.
@@ -238,7 +252,7 @@ class Batches(Iterator[Kind]):
                 self.close()
                 raise InputError(loaded.error)
             if loaded.batch is not None:
-                return cast(Kind, loaded.batch)
+                return loaded.batch
 
     def close(self) -> None:
         """Stop the worker processes; no batch can be read afterwards."""
@@ -254,8 +268,8 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     seed: int,
     steps: range,
     rare: RareClasses | None = None,
-) -> Batches[Loadable]:
-    """Augmented training batches of the global steps in `steps`, made by ``transform.train``.
+) -> Batches:
+    """Load augmented training batches of the global steps in `steps`, by ``transform.train``.
 
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
@@ -267,22 +281,17 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     """
     steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
-    source = Examples(dataset, names, transform, settings.on_error == "skip", seed)
-    make: MakeExample = source.train
-    if rare is not None:
-        from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
-
-        make = RareClassExamples(source, rare)
+    source = Examples(dataset, names, transform, settings.on_error == "skip", seed, rare)
     keys = _train_keys(len(names), settings.batch_size, steps, seed, is_shuffled=rare is None)
     own_samples = slice(rank(), None, num_processes())
     own_keys = (whole_batch[own_samples] for whole_batch in keys)
-    return Batches(BatchReader(make, CROP_ADVICE), keys=own_keys, settings=settings)
+    return Batches(BatchReader(source.train, CROP_ADVICE), keys=own_keys, settings=settings)
 
 
 def eval_batches(
     dataset: LabelledDataset, split: str, transform: Transform, settings: LoaderSettings
-) -> Batches[Batch]:
-    """Every sample of the split once, in the order of its list, made by ``transform.test``.
+) -> Batches:
+    """Load every sample of the split once, in the order of its list, by ``transform.test``.
 
     Process r of W has the batches r, r + W, r + 2 W, ..., possibly none.
     """
@@ -297,7 +306,7 @@ def eval_batches(
 def steps_per_epoch(
     dataset: LabelledDataset, settings: LoaderSettings, split: str = "train"
 ) -> int:
-    """Whole batches of one epoch, at least 1.
+    """Return the number of whole batches of one epoch, at least 1.
 
     InputError: the split is smaller than a batch; the processes cannot share one equally.
     """
@@ -323,7 +332,7 @@ def check_batch_size(settings: LoaderSettings, processes: int) -> None:
 def _train_keys(
     size: int, batch_size: int, steps: range, seed: int, *, is_shuffled: bool
 ) -> Iterator[list[tuple[int, int]]]:
-    """(epoch, index in the split) of every sample of every step."""
+    """Yield (epoch, index in the split) of every sample, step by step."""
     drawn, order = -1, list(range(size))
     for step in steps:
         epoch, position = divmod(step, size // batch_size)
@@ -335,7 +344,7 @@ def _train_keys(
 
 
 def start_worker(_: int) -> None:
-    """Settings of a worker process."""
+    """Set up a worker process."""
     # There is one process per core; threads of OpenCV would compete with them.
     cv2.setNumThreads(0)
     # A terminal and a cluster signal all processes of a run. The main process needs its workers
@@ -356,15 +365,17 @@ def _end_with_parent() -> None:
     os._exit(0)
 
 
-def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """`batch`, a dataclass, with `change` applied to each of its tensors."""
-    values = {each.name: getattr(batch, each.name) for each in fields(batch)}
-    tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
-    return replace(batch, **{name: change(value) for name, value in tensors.items()})
+def _changed(batch: Batch, change: Callable[[Tensor], Tensor]) -> Batch:
+    """Apply `change` to every tensor of `batch`."""
+    changed: dict[str, Any] = {}
+    for name, value in vars(batch).items():
+        if isinstance(value, Tensor):
+            changed[name] = change(value)
+    return replace(batch, **changed)
 
 
 def _shared(tensor: Tensor) -> Tensor:
-    """`tensor` in memory that the main process can read.
+    """Move `tensor` to memory that the main process can read.
 
     The worker's queue would do so too, but in a thread whose errors are not reported: the main
     process would wait forever.
@@ -379,29 +390,8 @@ def _shared(tensor: Tensor) -> Tensor:
     return tensor
 
 
-@dataclass(frozen=True)
-class LoadedPair:
-    """The batches of both domains; on the device they are `TwoDomains`.
-
-    `step` is the optimiser step that it is for, counted from the start of the run.
-    """
-
-    source: Loadable
-    target: Loadable
-    step: int
-
-    @property
-    def name(self) -> tuple[str, ...]:
-        """Names of all samples, those of the source first."""
-        return self.source.name + self.target.name
-
-    def to(self, device: torch.device | str) -> TwoDomains:
-        """Both batches on `device` (see `Batch.to`)."""
-        return TwoDomains(self.source.to(device), self.target.to(device), self.step)
-
-
-class PairedBatches(Iterator[LoadedPair]):
-    """A batch of the source with a batch of the target, each from its own stream.
+class PairedBatches(Iterator[TwoDomains]):
+    """Pairs a batch of the source with one of the target, each from its own stream.
 
     The two lists may differ in length. Each is shuffled again at its end, and an epoch of the run
     is one of the source.
@@ -410,28 +400,26 @@ class PairedBatches(Iterator[LoadedPair]):
     belong to one optimiser step and have its number.
     """
 
-    def __init__(
-        self, source: Batches[Loadable], target: Batches[Loadable], *, first: int, per_step: int
-    ) -> None:
-        self._both = (source, target)
+    def __init__(self, source: Batches, target: Batches, *, first: int, per_step: int) -> None:
+        self._source, self._target = source, target
         self._numbers = count(first)
         self._per_step = per_step
 
-    def __next__(self) -> LoadedPair:
-        """The next pair; errors as of `Batches`."""
+    def __next__(self) -> TwoDomains:
+        """Return the next pair; errors as of `Batches`."""
         try:
-            source, target = [next(each) for each in self._both]
+            source, target = next(self._source), next(self._target)
         except BaseException:
             self.close()
             raise
-        return LoadedPair(source, target, next(self._numbers) // self._per_step)
+        return TwoDomains(source, target, next(self._numbers) // self._per_step)
 
     @property
     def skipped(self) -> dict[str, str]:
-        """Name -> error, of the samples skipped so far."""
-        return self._both[0].skipped | self._both[1].skipped
+        """Errors of the samples skipped so far, by name."""
+        return self._source.skipped | self._target.skipped
 
     def close(self) -> None:
         """Stop the worker processes of both."""
-        for each in self._both:
-            each.close()
+        self._source.close()
+        self._target.close()

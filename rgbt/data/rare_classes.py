@@ -6,7 +6,7 @@ has draws of its own (seed, purpose, epoch, number).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.data.labels import PixelCounts, pixels_of
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.data.loaders import Examples
 from rgbt.dataset import LabelledDataset
-from rgbt.randomness import numpy_generator
 from rgbt.types import Example
 
 # Labels that are decoded at a time.
@@ -30,7 +28,7 @@ MOST_REDRAWS = 10
 
 
 def class_probabilities(pixels: PixelCounts, temperature: float) -> NDArray[np.float64]:
-    """Probability that each class is drawn, highest for the rarest.
+    """Compute the probability that each class is drawn, highest for the rarest.
 
         P(c) proportional to exp((1 - f_c) / T),   f_c the share of all pixels
 
@@ -48,7 +46,7 @@ def class_probabilities(pixels: PixelCounts, temperature: float) -> NDArray[np.f
 
 @dataclass(frozen=True)
 class RareClasses:
-    """How the images of a split are drawn.
+    """Draws images of a split by their classes.
 
     Attributes:
         classes: indices of the C classes that are drawn; `names` and `probabilities` (C,) are
@@ -64,13 +62,13 @@ class RareClasses:
     min_crop_pixels: float | None
 
     def draw(self, rng: np.random.Generator) -> tuple[int, NDArray[np.int64]]:
-        """A class, and positions of its images: the drawn one, then the others in their order."""
+        """Draw a class and the positions of its images: the drawn one, then the others in order."""
         number = int(rng.choice(len(self.classes), p=self.probabilities))
         images = self.images[number]
         return self.classes[number], np.roll(images, -int(rng.integers(len(images))))
 
     def shares(self) -> str:
-        """The probability of each class, highest first: "fence 0.265, terrain 0.202"."""
+        """Write the probability of each class, highest first: "fence 0.265, terrain 0.202"."""
         order = np.argsort(-self.probabilities, kind="stable")
         return ", ".join(f"{self.names[n]} {self.probabilities[n]:.3f}" for n in order)
 
@@ -78,7 +76,7 @@ class RareClasses:
 def class_pixels(
     dataset: LabelledDataset, split: str, *, on_error: Literal["raise", "skip"] = "raise"
 ) -> PixelCounts:
-    """Pixels of each class in each label of a split as stored, (N, K), see `pixels_of`."""
+    """Count pixels of each class in each label of a split as stored, (N, K), see `pixels_of`."""
 
     def counted(name: str) -> PixelCounts:
         return pixels_of(dataset, name, on_error)[:-1]
@@ -90,7 +88,7 @@ def class_pixels(
 def count_rare_classes(
     dataset: LabelledDataset, split: str, settings: LoaderSettings
 ) -> RareClasses:
-    """Count the labels of a split, and how its images are drawn.
+    """Count the labels of a split, and decide how its images are drawn.
 
     An image is drawn for a class if it has more than `min_class_pixels` pixels of it, in the label
     as stored (Paper: any pixel.   Released: more than 3000). Classes that never occur are not
@@ -119,29 +117,15 @@ def count_rare_classes(
     )
 
 
-@dataclass(frozen=True)
-class RareClassExamples:
-    """Augmented examples of drawn classes; a key is (epoch, number of the sample in it)."""
+def crop_showing(drawn: int, least: float | None, augment: Callable[[], Example]) -> Example:
+    """Augment a sample until its crop shows more than `least` pixels of the class `drawn`.
 
-    source: Examples
-    rare: RareClasses
-
-    def __call__(self, key: Sequence[int], skipped: dict[str, str]) -> Example:
-        """The example of `key`: of a drawn image, or of the next readable one of the class.
-
-        It is augmented again, up to `MOST_REDRAWS` times, until it has more than
-        `min_crop_pixels` pixels of the class; the last one is kept in any case. Released: more than
-        half of 3000 pixels (DAFormer), or twice as many (HRDA, MIC); never again at a ratio of 0.
-        InputError: no image of the class can be read.
-        """
-        drawn, positions = self.rare.draw(numpy_generator(self.source.seed, "rare class", *key))
-        names = [self.source.names[position] for position in positions]
-        sample = self.source.first_readable(names, skipped)
-        rng = numpy_generator(self.source.seed, "augment", *key)
-        example = self.source.transform.train(sample, rng)
-        least = self.rare.min_crop_pixels
-        for _ in range(MOST_REDRAWS):
-            if least is None or np.count_nonzero(example.label == drawn) > least:
-                break
-            example = self.source.transform.train(sample, rng)
-        return example
+    It is augmented again up to `MOST_REDRAWS` times; the last example is kept in any case.
+    Released: more than half of 3000 pixels (DAFormer), or twice as many (HRDA, MIC). None: once.
+    """
+    example = augment()
+    for _ in range(MOST_REDRAWS):
+        if least is None or np.count_nonzero(example.label == drawn) > least:
+            break
+        example = augment()
+    return example

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.checks import InputError
-from rgbt.processes import agreed, num_processes, total
+from rgbt.processes import computed_once, num_processes, total
 
 TORCH_LAYERS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
 
@@ -37,7 +37,7 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
 
 
 def _converted(module: nn.Module) -> nn.Module:
-    """`module` with every batch normalisation of torch replaced, with its own tensors."""
+    """Replace every batch normalisation of torch in `module`, keeping its tensors."""
     if isinstance(module, TORCH_LAYERS):
         made = SynchronisedBatchNorm(module.num_features)
         made.__dict__ |= module.__dict__
@@ -49,21 +49,24 @@ def _converted(module: nn.Module) -> nn.Module:
 
 def share_running_statistics(model: nn.Module) -> None:
     """Give every process the running statistics of process 0; called by all."""
-    norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
-    buffers = [buffer for norm in norms for buffer in norm.buffers(recurse=False)]
-    for buffer, value in zip(buffers, agreed([each.cpu() for each in buffers]), strict=True):
+    buffers: list[Tensor] = []
+    for module in model.modules():
+        if isinstance(module, _BatchNorm):
+            buffers += module.buffers(recurse=False)
+    first = computed_once(lambda: [buffer.cpu() for buffer in buffers])
+    for buffer, value in zip(buffers, first, strict=True):
         buffer.copy_(value)
 
 
 class SynchronisedBatchNorm(_BatchNorm):
-    """Batch normalisation over the samples of all processes, as many each; torch has one for CUDA.
+    """Normalises over the samples of all processes, as many each; torch has one for CUDA.
 
     The variance is computed from differences to the mean, so that the result equals that of one
     process to rounding.
     """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the name in torch
-        """(N, C, ...) -> the same shape and dtype; computed in float32 for half precision too."""
+        """Normalise (N, C, ...), in float32 for half precision too; same shape and dtype."""
         if not self.training:
             return super().forward(input)
         x = input.to(torch.promote_types(input.dtype, torch.float32))
@@ -91,4 +94,4 @@ class SynchronisedBatchNorm(_BatchNorm):
             running.mul_(1 - share).add_(new, alpha=share)
 
     def _check_input_dim(self, input: Tensor) -> None:  # noqa: A002 - the name in torch
-        """Any number of dimensions."""
+        """Accept any number of dimensions."""

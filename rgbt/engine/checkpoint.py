@@ -24,6 +24,7 @@ from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, sav
 from rgbt.checks import InputError, RunError, one_line
 from rgbt.engine.settings import TrainerSettings
 
+LAST, BEST = "last.pt", "best.pt"  # names in the run folder
 UNAVERAGED = "unaveraged"  # weights of the last step, where "model" has averaged ones
 WARM_UP = 9  # the decay of step n is at most n / (n + 9), as in TensorFlow's moving average
 CHANGING = {"lr", "foreach", "fused", "capturable"}  # set before every step, or by the device
@@ -31,7 +32,7 @@ Count = Annotated[int, Ge(0)]
 
 
 class EvaluatedWeights:
-    """The weights of a network that are evaluated: its own, or those of an average, a copy.
+    """Holds the weights of a network that are evaluated: its own, or their average in a copy.
 
     Source: "ema" is the teacher of Tarvainen and Valpola (2017); "last" is stochastic weight
     averaging of Izmailov et al. (2018), but statistics of batch normalisation are averaged, not
@@ -59,12 +60,12 @@ class EvaluatedWeights:
 
     @property
     def network(self) -> nn.Module:
-        """The network to evaluate: the average, or the trained one before an average begins."""
+        """Return the network to evaluate: the average, or the trained one before it begins."""
         average = self._average if self._is_begun else None
         return self._model if average is None else average.module
 
     def state(self) -> dict[str, dict[str, Tensor]]:
-        """Weights to evaluate ("model"), and to resume from where these are others."""
+        """Return weights to evaluate ("model"), and to resume from where these are others."""
         own = {} if self.network is self._model else {UNAVERAGED: self._model.state_dict()}
         return {"model": self.network.state_dict(), **own}
 
@@ -78,7 +79,7 @@ class EvaluatedWeights:
 
 @dataclass
 class State:
-    """Progress of a run. Generators need no entry: they are derived from seed and step.
+    """Holds the progress of a run. Generators need no entry: they follow from seed and step.
 
     `evaluated_step` is that of the last evaluation: a signal may have come before that of `step`.
     `unlogged` are values since the last line of ``metrics.jsonl``. `key` and `settings` (a digest,
@@ -101,7 +102,7 @@ class State:
 
     @classmethod
     def of(cls, payload: Mapping[str, Any]) -> State:
-        """The state in a checkpoint; TypeError: none."""
+        """Return the state in a checkpoint; TypeError: none."""
         try:
             text = json.dumps(payload.get("state"))
             return TypeAdapter(cls).validate_json(text, strict=True)
@@ -115,7 +116,7 @@ def training_payload(
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
 ) -> dict[str, Any]:
-    """Everything a run needs to resume; `weights` are those of `EvaluatedWeights.state`."""
+    """Gather what a run needs to resume; `weights` are those of `EvaluatedWeights.state`."""
     return {
         **weights,
         "others": {name: module.state_dict() for name, module in others.items()},
@@ -125,13 +126,16 @@ def training_payload(
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The payload of a checkpoint of rgbt, tensors on the CPU; InputError: it is none."""
+    """Load the payload of a checkpoint of rgbt, tensors on the CPU; InputError: it is none."""
     payload = read_torch_file(path)
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
-    groups = [loaded.get(key, {}) for key in ("others", "optimizers")]
-    parts = [loaded.get("model"), loaded.get(UNAVERAGED, {}), *groups]
-    parts += [each for group in groups if isinstance(group, dict) for each in group.values()]
-    if not all(isinstance(each, dict) for each in parts):
+    parts = [loaded.get("model"), loaded.get(UNAVERAGED, {})]
+    for key in ("others", "optimizers"):
+        group = loaded.get(key, {})
+        parts.append(group)
+        if isinstance(group, dict):
+            parts += group.values()
+    if not all(isinstance(part, dict) for part in parts):
         raise InputError(f"{path} is no checkpoint written by `rgbt run`.")
     return loaded
 
@@ -147,7 +151,7 @@ def check_origin(payload: Mapping[str, Any], source: Path, key: str, settings: s
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
-    """The step of a last or a best checkpoint; InputError if it does not say."""
+    """Return the step of a last or a best checkpoint; InputError if it does not say."""
     state = payload.get("state", payload)
     step = state.get("step") if isinstance(state, dict) else None
     if not isinstance(step, int):
@@ -168,7 +172,8 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
     """Restore the state of an optimizer; InputError: it is that of another one."""
     try:
         groups = optimizer.state_dict()["param_groups"]
-        _check_places(optimizer, groups, stored)
+        _check_settings(groups, stored["param_groups"])
+        _check_states(optimizer, stored["state"])
         optimizer.load_state_dict({**stored, "param_groups": groups})
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         said = f"{source} holds the state of a different optimizer than that of this run"
@@ -181,17 +186,27 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
                 state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
-def _check_places(optimizer: torch.optim.Optimizer, groups: Any, stored: Any) -> None:
-    """Raise an error for other settings, or for values at whose step torch would end by SIGSEGV."""
-    for own, group in zip(groups, stored["param_groups"], strict=True):
+def _check_settings(groups: Any, stored: Any) -> None:
+    """Raise an error for stored groups of parameters with other settings than `groups`."""
+    for own, group in zip(groups, stored, strict=True):
         for key in own.keys() - CHANGING:
             if own[key] != group[key]:
                 raise ValueError(f"{key} is {group[key]}")
-    of_state = [{n: type(v) for n, v in each.items()} for each in stored["state"].values()]
-    if any(each != of_state[0] for each in of_state):
-        raise ValueError("the states of parameters differ in kind")
-    places = dict(enumerate(each for group in optimizer.param_groups for each in group["params"]))
-    for index, state in stored["state"].items():
+
+
+def _check_states(optimizer: torch.optim.Optimizer, stored: Any) -> None:
+    """Raise an error for stored states at whose step torch would end by SIGSEGV."""
+    parameters: list[nn.Parameter] = []
+    for group in optimizer.param_groups:
+        parameters += group["params"]
+    places = dict(enumerate(parameters))
+    kinds: dict[str, type] | None = None
+    for index, state in stored.items():
+        found = {name: type(value) for name, value in state.items()}
+        if kinds is None:
+            kinds = found
+        if found != kinds:
+            raise ValueError("the states of parameters differ in kind")
         place = places[index]
         for name, value in state.items():
             if not isinstance(value, Tensor):
@@ -201,45 +216,42 @@ def _check_places(optimizer: torch.optim.Optimizer, groups: Any, stored: Any) ->
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
-class Checkpoints:
-    """Read and write the checkpoints of the run folder `folder` (see the module)."""
+def commit(folder: Path, payload: dict[str, Any], state: State) -> None:
+    """Write the weights if this step is the best, then the state, to a run folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if state.step == state.best_step > 0:
+        origin = {"key": state.key, "settings": state.settings}
+        save(folder / BEST, {"model": payload["model"], "step": state.step, NOTE: origin})
+    save(folder / LAST, payload)
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.last, self.best = folder / "last.pt", folder / "best.pt"
 
-    def commit(self, payload: dict[str, Any], state: State) -> None:
-        """Write the weights if this step is the best, then the state."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        if state.step == state.best_step > 0:
-            origin = {"key": state.key, "settings": state.settings}
-            save(self.best, {"model": payload["model"], "step": state.step, NOTE: origin})
-        save(self.last, payload)
+def load_last(folder: Path) -> tuple[dict[str, Any], State]:
+    """Load the last checkpoint of a run folder and its state; RunError: a file is unusable."""
+    with _saying_what_to_do(folder):
+        payload = load_checkpoint(folder / LAST)
+        state = State.of(payload)
+    if state.best_step:
+        load_best(folder, state)
+    return payload, state
 
-    def load(self) -> tuple[dict[str, Any], State]:
-        """The payload of the last checkpoint and its state; RunError: a file is unusable."""
-        with self._saying_what_to_do():
-            payload = load_checkpoint(self.last)
-            state = State.of(payload)
-        if state.best_step:
-            self.load_best(state)
-        return payload, state
 
-    def load_best(self, state: State) -> dict[str, Any]:
-        """The best weights of a run; RunError: the file is unusable or of another step."""
-        with self._saying_what_to_do():
-            payload = load_checkpoint(self.best)
-            check_origin(payload, self.best, state.key, state.settings)
-            found = step_of(payload, self.best)
-            # Weights of a later step were written just before the run was killed.
-            if found != state.best_step and found <= state.step:
-                raise InputError(f"{self.best} is of step {found}, not of {state.best_step}")
-        return dict(payload["model"])
+def load_best(folder: Path, state: State) -> dict[str, Any]:
+    """Load the best weights of a run; RunError: the file is unusable or of another step."""
+    best = folder / BEST
+    with _saying_what_to_do(folder):
+        payload = load_checkpoint(best)
+        check_origin(payload, best, state.key, state.settings)
+        found = step_of(payload, best)
+        # Weights of a later step were written just before the run was killed.
+        if found != state.best_step and found <= state.step:
+            raise InputError(f"{best} is of step {found}, not of {state.best_step}")
+    return dict(payload["model"])
 
-    @contextmanager
-    def _saying_what_to_do(self) -> Iterator[None]:
-        try:
-            yield
-        except (InputError, TypeError) as error:
-            advice = "remove the folder and rerun the command to train the run from the start."
-            raise RunError(f"{self.folder}: {one_line(error)}; {advice}") from error
+
+@contextmanager
+def _saying_what_to_do(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (InputError, TypeError) as error:
+        advice = "remove the folder and rerun the command to train the run from the start."
+        raise RunError(f"{folder}: {one_line(error)}; {advice}") from error

@@ -10,7 +10,8 @@ import os
 import platform
 import re
 import warnings
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -28,7 +29,7 @@ MODES = {"default": "default", "max-autotune": "max-autotune-no-cudagraphs"}
 
 
 def choose_device(trainer: TrainerSettings) -> torch.device:
-    """The device of a run in one process; "auto" prefers a GPU. InputError: there is none."""
+    """Choose the device of one process; "auto" prefers a GPU. InputError: there is none."""
     found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     kinds = [*(kind for kind, is_there in found.items() if is_there), "cpu"]
     kind = kinds[0] if trainer.accelerator == "auto" else trainer.accelerator
@@ -38,7 +39,7 @@ def choose_device(trainer: TrainerSettings) -> torch.device:
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
-    """Context of a forward pass on a device."""
+    """Return the context of a forward pass on a device."""
     if precision == "32-true":
         return nullcontext()
     return torch.autocast(device.type, dtype=torch.bfloat16)
@@ -72,7 +73,7 @@ def keep_memory() -> None:
 
 
 def place(network: nn.Module, device: torch.device, settings: TrainerSettings) -> nn.Module:
-    """The network on `device`; convolutions with kernels in "channels_last" return such maps."""
+    """Move a network to `device`; convolutions with kernels in "channels_last" return such maps."""
     if settings.memory_format == "contiguous":
         return network.to(device)
     moved: nn.Module = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -91,71 +92,64 @@ def prepare_training(network: nn.Module, settings: TrainerSettings) -> None:
     if settings.compile != "none":
         # The graph recomputes what these functions keep per size, which costs little.
         warnings.filterwarnings("ignore", message=r"(?s).*lru_cache", category=UserWarning)
-        object.__setattr__(network, "forward", Compiled(network, MODES[settings.compile]))
-
-
-class Compiled:
-    """The forward of a network: compiled in training (at the first call), its own in evaluation."""
-
-    def __init__(self, network: nn.Module, mode: str) -> None:
-        self.network, self.plain = network, network.forward
-        self.compiled = torch.compile(network.forward, mode=mode)
-
-    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """Call the forward."""
-        trains = self.network.training and torch.is_grad_enabled()
-        return (self.compiled if trains else self.plain)(*arguments, **keywords)
+        object.__setattr__(network, "forward", TrainingForward(network, MODES[settings.compile]))
 
 
 def recompute_activations(network: nn.Module) -> None:
     """Compute activations of the modules in `Record.recomputed`, which draw nothing, again."""
-    patterns = [
-        re.escape(each).replace(r"\*", "[^.]*")
-        for each in record_of(network, NetworkRecord).recomputed
-    ]
-    pattern = re.compile("|".join(patterns))
-    modules = [each for name, each in network.named_modules() if name and pattern.fullmatch(name)]
+    declared = record_of(network, NetworkRecord).recomputed
+    pattern = "|".join(re.escape(names).replace(r"\*", "[^.]*") for names in declared)
+    modules = []
+    for name, module in network.named_modules():
+        if name and re.fullmatch(pattern, name):
+            modules.append(module)
     if not modules:
         raise InputError(
             "trainer.activation_checkpointing: the network has no module that the record of "
             f'{type(network).__name__} declares; write recomputed=("blocks.*",) there.'
         )
     for module in modules:
-        object.__setattr__(module, "forward", Recomputed(module))
+        object.__setattr__(module, "forward", TrainingForward(module))
 
 
-class Recomputed:
-    """The forward of a module that keeps its inputs alone in training."""
+class TrainingForward:
+    """Calls the forward of a module: in training compiled or computed twice, else as it is.
 
-    def __init__(self, module: nn.Module) -> None:
+    In training without a `mode` of torch.compile, it keeps its inputs alone, and is computed again
+    in the backward pass. A copy of the module has a copy of it (therefore it is no function).
+    """
+
+    def __init__(self, module: nn.Module, mode: str | None = None) -> None:
         self.module, self.forward = module, module.forward
+        self.compiled = None if mode is None else torch.compile(module.forward, mode=mode)
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """Call the forward."""
+        """Call the forward; the first call in training compiles it."""
         if not (self.module.training and torch.is_grad_enabled()):
             return self.forward(*arguments, **keywords)
+        if self.compiled is not None:
+            return self.compiled(*arguments, **keywords)
         return checkpoint(
             self.forward,
             *arguments,
             use_reentrant=False,
             preserve_rng_state=False,
-            context_fn=lambda: (nullcontext(), KeptStatistics(self.module)),
+            context_fn=lambda: (nullcontext(), _keeping_buffers(self.module)),
             **keywords,
         )
 
 
-class KeptStatistics(AbstractContextManager[None]):
-    """A context in which buffers are copies: only the forward updates running statistics."""
-
-    def __init__(self, module: nn.Module) -> None:
-        self.module = module
-
-    def __enter__(self) -> None:
-        modules = self.module.modules()
-        self.kept = [(m, n, b) for m in modules for n, b in m.named_buffers(recurse=False)]
-        for module, name, buffer in self.kept:
-            setattr(module, name, buffer.clone())
-
-    def __exit__(self, *_: object) -> None:
-        for module, name, buffer in self.kept:
-            setattr(module, name, buffer)
+@contextmanager
+def _keeping_buffers(module: nn.Module) -> Iterator[None]:
+    """Let buffers be copies: only the first forward updates running statistics."""
+    kept = []
+    for part in module.modules():
+        for name, buffer in part.named_buffers(recurse=False):
+            kept.append((part, name, buffer))
+    for part, name, buffer in kept:
+        setattr(part, name, buffer.clone())
+    try:
+        yield
+    finally:
+        for part, name, buffer in kept:
+            setattr(part, name, buffer)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -23,12 +22,12 @@ FAINTEST = 1e-6  # smallest sum of scores of masks that is a denominator
 
 @torch.inference_mode()
 def class_maps(model: nn.Module, batch: Batch, *how: Any, **settings: Any) -> Tensor:
-    """(B, H', W') uint8: class of every pixel of the labels; arguments as in `label_scores`."""
+    """Predict the class of every label pixel, (B, H', W') uint8; arguments of `label_scores`."""
     return classes_of(label_scores(model, batch, *how, **settings)).to(torch.uint8)
 
 
 def shares(scores: Tensor, model: nn.Module) -> Tensor:
-    """(B, K, H', W') float32: probabilities of the classes, of their scores by `label_scores`.
+    """Turn scores of `label_scores` into probabilities of the classes, (B, K, H', W') float32.
 
     That is their softmax. Scores of networks that return masks are sums over queries (Mask2Former,
     semantic inference), whose softmax would hardly differ; each is divided by the sum over classes.
@@ -47,7 +46,7 @@ def label_scores(
     heads: Sequence[str | None] = (),
     settings: Prediction = WHOLE,
 ) -> Tensor:
-    """(B, K, H', W') float32 scores at every pixel of the labels; averaged ones as logarithms.
+    """Predict (B, K, H', W') float32 scores at every label pixel; averaged ones as logarithms.
 
     Args:
         model: a network in evaluation mode.
@@ -60,7 +59,9 @@ def label_scores(
     Raises:
         RunError: a score is NaN or infinite.
     """
-    scores_of = partial(class_scores, model, view=view, heads=heads)
+
+    def scores_of(images: Batch) -> Tensor:
+        return class_scores(model, images, view, heads)
 
     def enlarged(scores: Tensor) -> Tensor:
         size, aligned = batch.label.shape[-2:], settings.align_corners
@@ -80,8 +81,8 @@ def label_scores(
             scores = enlarged(scores_of(batch).float())
     # One fast pass: a sum is not finite if any score is not. Only then each image is checked.
     suspects = () if scores.sum().isfinite() else zip(batch.name, scores, strict=True)
-    for name, each in suspects:
-        if not each.isfinite().all():
+    for name, of_image in suspects:
+        if not of_image.isfinite().all():
             raise RunError(
                 f"image '{name}': the network's class scores are NaN or infinite. Use other "
                 "weights, or train with a lower optimizer.lr."
@@ -92,7 +93,7 @@ def label_scores(
 def class_scores(
     model: nn.Module, batch: Batch, view: View | None = None, heads: Sequence[str | None] = ()
 ) -> Tensor:
-    """(B, K, H, W) scores at the size of the images; arguments as in `label_scores`."""
+    """Predict (B, K, H, W) scores at the size of the images; arguments as in `label_scores`."""
     options: dict[str, Any] = {} if view is None else {"views": (view,)}
     distinct = tuple(dict.fromkeys(heads))
     if len(distinct) < 2:
@@ -102,7 +103,7 @@ def class_scores(
     # One pass per head over the images that are its own; normalisations do not look at the batch.
     found: dict[str | None, Iterator[Tensor]] = {}
     for head in distinct:
-        own = torch.tensor([each == head for each in heads], device=batch.rgb.device)
+        own = torch.tensor([other == head for other in heads], device=batch.rgb.device)
         output = model(batch.rgb[own], batch.thermal[own], head=head, **options)
         found[head] = iter(output.logits)
     return torch.stack([next(found[head]) for head in heads])
@@ -111,22 +112,23 @@ def class_scores(
 def _resized(batch: Batch, scale: float) -> Batch:
     if scale == 1.0:
         return batch
-    size = tuple(round(scale * side) for side in batch.rgb.shape[-2:])
-    resized = partial(F.interpolate, size=size, mode="bilinear")
-    return replace(batch, rgb=resized(batch.rgb), thermal=resized(batch.thermal))
+    height, width = batch.rgb.shape[-2:]
+    size = (round(scale * height), round(scale * width))
+    rgb = F.interpolate(batch.rgb, size, mode="bilinear")
+    return replace(batch, rgb=rgb, thermal=F.interpolate(batch.thermal, size, mode="bilinear"))
 
 
 def _window_shares(
     scores_of: Callable[[Batch], Tensor], batch: Batch, settings: Prediction
 ) -> Tensor:
-    """(B, K, H, W) float32: mean probabilities of the windows that show a pixel, and of mirrors."""
+    """Average probabilities of the windows that show a pixel, and of mirrors: (B, K, H, W)."""
     height, width = batch.rgb.shape[-2:]
     window = settings.window_hw or (height, width)
     total: Tensor | None = None
     count = batch.rgb.new_zeros(height, width)
     for rows in windows(height, window[0], settings.window_stride):
         for columns in windows(width, window[1], settings.window_stride):
-            rgb, thermal = (each[..., rows, columns] for each in (batch.rgb, batch.thermal))
+            rgb, thermal = batch.rgb[..., rows, columns], batch.thermal[..., rows, columns]
             shares = scores_of(replace(batch, rgb=rgb, thermal=thermal)).float().softmax(1)
             if settings.mirrored:
                 mirrored = replace(batch, rgb=rgb.flip(-1), thermal=thermal.flip(-1))
@@ -140,7 +142,7 @@ def _window_shares(
 
 
 def windows(length: int, side: int, stride: float) -> Iterator[slice]:
-    """Windows of `side` pixels along an axis up to its end; source: semseg, test script."""
+    """Yield windows of `side` pixels along an axis to its end; source: semseg, test script."""
     side = min(side, length)
     step = math.ceil(side * stride)
     for index in range(math.ceil((length - side) / step) + 1):

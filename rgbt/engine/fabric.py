@@ -24,7 +24,7 @@ PATIENCE = timedelta(days=7)  # process 0 may wait for the training of another c
 
 
 def open_fabric(trainer: TrainerSettings) -> Fabric:
-    """Device and precision of this process; of several, it connects them the first time."""
+    """Open Fabric for the device of this process; of several, it connects them the first time."""
     device, group = choose_device(trainer), group_from_environment()
     if group is None:
         # Without an environment, Fabric reads the variables of SLURM, also for a single process.
@@ -54,7 +54,7 @@ def open_fabric(trainer: TrainerSettings) -> Fabric:
 
 
 class _OneProcessPerDevice(DDPStrategy):
-    """Places and connects the processes; the loop averages gradients (`rgbt.engine.trainer`)."""
+    """Places and connects the processes; the loop averages gradients (`rgbt.processes`)."""
 
     def setup_module(self, module: nn.Module) -> nn.Module:  # type: ignore[override]
         return module

@@ -28,20 +28,21 @@ def naming_memory(device: torch.device, what: str, advice: str) -> Iterator[None
         found = ""
         if device.type == "cuda":
             peak = torch.cuda.max_memory_allocated(device) / 2**30
-            free, size = (each / 2**30 for each in torch.cuda.mem_get_info(device))
-            found = f" (GiB: {peak:.1f} used at most, {free:.1f} of {size:.1f} free)"
+            free, size = torch.cuda.mem_get_info(device)
+            rest = f"{free / 2**30:.1f} of {size / 2**30:.1f} free"
+            found = f" (GiB: {peak:.1f} used at most, {rest})"
         raise InputError(f"{device} is out of memory in {what}{found}. {advice}") from error
 
 
 def training_advice(
     trainer: TrainerSettings, batch_size: int, network: NetworkRecord, crop_hw: object
 ) -> str:
-    """Settings with which a training needs less: those that resume it, and those of a new run."""
+    """Name settings with which a training needs less: to resume it, and for a new run."""
     same, other = [], []
     if network.recomputed and trainer.compile == "none" and not trainer.activation_checkpointing:
         same.append("trainer.activation_checkpointing=true")
     share = batch_size // num_processes()
-    parts = next((each for each in range(2, share + 1) if share % each == 0), None)
+    parts = next((number for number in range(2, share + 1) if share % number == 0), None)
     if parts is None:
         other.append("a smaller transform.crop_hw" if crop_hw else "smaller images")
     else:

@@ -9,7 +9,6 @@ base rate that a schedule reads; one with `constant` keeps that rate.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain
 from typing import Annotated, Any, Literal
 
 import torch
@@ -27,7 +26,7 @@ Decay = Annotated[float, Interval(ge=0, le=100)]
 
 @dataclass(frozen=True, kw_only=True)
 class AdamW:
-    """`torch.optim.AdamW` with two learning rates and two weight decays.
+    """Builds `torch.optim.AdamW` with two learning rates and two weight decays.
 
     Source: CRM release, `train` configuration. What the network counts as pretrained
     (`pretrained_parts` of its record) has the rate ``lr * backbone_multiplier``. Affine parameters
@@ -45,15 +44,15 @@ class AdamW:
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         undecayed = UNDECAYED_NAMES + (() if self.decay_biases else ("bias", "in_proj_bias"))
         groups = []
-        for (pretrained, decayed), each in parameter_groups(model, undecayed, without).items():
+        for (pretrained, decayed), part in parameter_groups(model, undecayed, without).items():
             rate = self.lr * (self.backbone_multiplier if pretrained else 1.0)
-            groups.append(_group(each, rate) | {"weight_decay": self.weight_decay * decayed})
+            groups.append(_group(part, rate) | {"weight_decay": self.weight_decay * decayed})
         return torch.optim.AdamW(groups, betas=self.betas, eps=self.eps, fused=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SGD:
-    """`torch.optim.SGD` with momentum that decays every parameter.
+    """Builds `torch.optim.SGD` with momentum that decays every parameter.
 
     Source: MFNet and RTFNet releases; thesis (J. Sun), code of the networks with one or two heads.
     `head_rate` "released": the rate of what is not pretrained stays `lr`; the thesis' code of
@@ -68,13 +67,15 @@ class SGD:
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         by_part: dict[bool, list[nn.Parameter]] = {}
-        for (pretrained, _), each in parameter_groups(model, (), without).items():
-            by_part.setdefault(pretrained, []).extend(each)
+        for (pretrained, _), part in parameter_groups(model, (), without).items():
+            by_part.setdefault(pretrained, []).extend(part)
         groups = []
-        for pretrained, each in by_part.items():
+        for pretrained, parameters in by_part.items():
             rate = self.lr * (self.backbone_multiplier if pretrained else 1.0)
-            is_constant = self.head_rate == "released" and not pretrained
-            groups.append(_group(each, rate) | ({"constant": True} if is_constant else {}))
+            group = _group(parameters, rate)
+            if self.head_rate == "released" and not pretrained:
+                group["constant"] = True
+            groups.append(group)
         # On a GPU the default makes a copy of all gradients to add the decay; the fused one none.
         # On a CPU it would change the last bits of published runs.
         fused = True if any(p.is_cuda for group in groups for p in group["params"]) else None
@@ -84,21 +85,21 @@ class SGD:
 
 @dataclass(frozen=True, kw_only=True)
 class RMSprop:
-    """`torch.optim.RMSprop` with one rate and no decay. Source: HeatNet release (rate 1e-4)."""
+    """Builds `torch.optim.RMSprop` with one rate, no decay. Source: HeatNet release (1e-4)."""
 
     lr: LearningRate
     alpha: ShareBelowOne
     eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
-        parameters = chain(*parameter_groups(model, (), without).values())
-        groups = [_group([*parameters], self.lr)]
-        return torch.optim.RMSprop(groups, alpha=self.alpha, eps=self.eps)
+        return torch.optim.RMSprop(
+            [_whole(model, without, self.lr)], alpha=self.alpha, eps=self.eps
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adam:
-    """`torch.optim.Adam` with one rate, for discriminators.
+    """Builds `torch.optim.Adam` with one rate, for discriminators.
 
     Source: AdaptSegNet (rate 1e-4, betas 0.9 and 0.99, no decay); thesis (J. Sun), code (1e-5).
     """
@@ -109,19 +110,26 @@ class Adam:
     eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
-        parameters = chain(*parameter_groups(model, (), without).values())
-        groups = [_group([*parameters], self.lr) | {"weight_decay": self.weight_decay}]
-        return torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
+        group = _whole(model, without, self.lr) | {"weight_decay": self.weight_decay}
+        return torch.optim.Adam([group], betas=self.betas, eps=self.eps, fused=True)
 
 
 def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
     return {"params": parameters, "lr": lr, "base_lr": lr}
 
 
+def _whole(model: nn.Module, without: tuple[str, ...], lr: float) -> dict[str, Any]:
+    """Make one group of all trainable parameters, in the order of `parameter_groups`."""
+    parameters: list[nn.Parameter] = []
+    for part in parameter_groups(model, (), without).values():
+        parameters += part
+    return _group(parameters, lr)
+
+
 def parameter_groups(
     model: nn.Module, undecayed_names: tuple[str, ...], without: tuple[str, ...] = ()
 ) -> dict[tuple[bool, bool], list[nn.Parameter]]:
-    """(pretrained, decayed) -> trainable parameters, each once even where modules are shared.
+    """Group trainable parameters by (pretrained, decayed), each once even if modules share it.
 
     Source: CRM release. Mask tokens and raw level embeddings are decayed; affine parameters of
     normalisations, `nn.Embedding` weights and `undecayed_names` (last words of names) are not.
@@ -149,8 +157,9 @@ def step_without_gradient(optimizer: torch.optim.Optimizer) -> None:
     leaves zeros, so that one optimiser of all parameters also steps those of the other phase.
     """
     optimizer.zero_grad()
-    for parameter in (each for group in optimizer.param_groups for each in group["params"]):
-        if optimizer.state.get(parameter):
-            parameter.grad = torch.zeros_like(parameter)
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            if optimizer.state.get(parameter):
+                parameter.grad = torch.zeros_like(parameter)
     optimizer.step()
     optimizer.zero_grad()

@@ -15,7 +15,7 @@ Scale = Annotated[float, Interval(ge=0.1, le=4)]
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """How an image is predicted in evaluation; conf/prediction/whole.yaml explains each key.
+    """Says how an image is predicted in evaluation; conf/prediction/whole.yaml explains each key.
 
     Source: thesis (J. Sun), its code, for everything named "released"; semseg (PSPNet), its test
     script, for windows, scales and mirrored images.
@@ -37,7 +37,7 @@ class Prediction:
 
     @property
     def record(self) -> Record:
-        """Class scores where probabilities are averaged."""
+        """Require class scores where probabilities are averaged."""
         if not self.averages:
             return Record()
         cause = "mirrored" if self.mirrored else "window_hw" if self.window_hw else "scales"

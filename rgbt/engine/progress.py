@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Callable
 from statistics import fmean, median
 
 from rich.console import Console
@@ -31,7 +32,7 @@ CONSOLE = Console(stderr=True)
 
 
 def progress() -> Progress:
-    """A progress display with columns for count, time left and a note (task field `note`)."""
+    """Make a progress display with columns for count, time left and a note (task field `note`)."""
     # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
     return Progress(
         SpinnerColumn(),
@@ -48,32 +49,33 @@ def progress() -> Progress:
     )
 
 
-class Pace:
-    """The time of the steps of a training; warns once where they become much slower.
+def watch_pace(threads: int) -> Callable[[float, float], None]:
+    """Return a function that notes every step of a training, and warns once if they become slow.
 
-    Medians are compared, so that one slow step is no reason.
+    Its arguments are the seconds of a step, and those in which the step waited for its images.
+    Medians are compared, so that one slow step is no reason. `threads` is for the message.
     """
+    first: list[float] = []
+    last: deque[tuple[float, float]] = deque(maxlen=NUM_LAST)
+    has_warned = False
 
-    def __init__(self, threads: int) -> None:
-        self._threads, self._has_warned = threads, False
-        self._first: list[float] = []
-        self._last: deque[tuple[float, float]] = deque(maxlen=NUM_LAST)
-
-    def add(self, seconds: float, waited: float) -> None:
-        """Note a step: its time, and the part of it in which it waited for its images."""
-        if self._has_warned:
+    def note(seconds: float, waited: float) -> None:
+        nonlocal has_warned
+        if has_warned:
             return
-        if len(self._first) < NUM_FIRST:
-            self._first.append(seconds)
-        self._last.append((seconds, waited))
-        usual, now = median(self._first), median(seconds for seconds, _ in self._last)
-        if len(self._first) < 2 * NUM_LAST or now < SLOWER * usual:
+        if len(first) < NUM_FIRST:
+            first.append(seconds)
+        last.append((seconds, waited))
+        usual, now = median(first), median(of_step for of_step, _ in last)
+        if len(first) < 2 * NUM_LAST or now < SLOWER * usual:
             return
-        self._has_warned = True
-        share = fmean(waited / seconds for seconds, waited in self._last)
+        has_warned = True
+        share = fmean(wait / of_step for of_step, wait in last)
         warn(
             f"a step takes {now:.3g} s now, {now / usual:.0f} times as long as before "
             f"({share:.0%} of it waiting for images). The load of this machine is "
             f"{os.getloadavg()[0]:.1f} on {usable_cores()} cores, and trainer.threads="
-            f"{self._threads}: see whether other programs need its cores, or its disk."
+            f"{threads}: see whether other programs need its cores, or its disk."
         )
+
+    return note

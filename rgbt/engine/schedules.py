@@ -4,21 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
 from rgbt.checks import InputError
 from rgbt.ranges import NumSteps, NumStepsOrZero, Power, Share
 
-
-class Schedule(Protocol):
-    """The interface of a schedule."""
-
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int, /) -> float:
-        """Factor of the base learning rate at `step`, from 0."""
+# (step from 0, steps of the run, steps of an epoch) -> factor of the base learning rate.
+Schedule = Callable[[int, int, int], float]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -196,12 +196,26 @@ def _read(path: Path, form: Any) -> Any:
 
 
 class RunFolder:
-    """Writes one run's folder, made where it does not exist; InputError for a link out of it."""
+    """Writes one run's folder, made where it does not exist; InputError for a link out of it.
 
-    def __init__(self, path: Path | str) -> None:
+    Of several processes that train a run, one opens it with `writes`. In the others it can be read,
+    and what would write does nothing.
+    """
+
+    def __init__(self, path: Path | str, *, writes: bool = True) -> None:
         self.path = Path(path).resolve()
-        self.path.mkdir(parents=True, exist_ok=True)
-        check_links(self.path)
+        self.writes = writes
+        if writes:
+            self.path.mkdir(parents=True, exist_ok=True)
+            check_links(self.path)
+
+    def _write(self, name: str, content: bytes) -> None:
+        if self.writes:
+            write_atomic(self.path / name, content)
+
+    def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        if self.writes:
+            write_json(self.path / name, value)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -228,7 +242,7 @@ class RunFolder:
 
     def write_config(self, text: str) -> None:
         """Write the resolved configuration (YAML text), sealed."""
-        write_atomic(self.path / "config.yaml", sealed_text(text.encode()))
+        self._write("config.yaml", sealed_text(text.encode()))
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
@@ -236,16 +250,18 @@ class RunFolder:
         diff = entry.get("diff") or ""
         name = f"diff_{len(before) + 1}.patch" if before else "diff.patch"
         if diff:
-            write_atomic(self.path / name, diff.encode())
+            self._write(name, diff.encode())
         entries = [*before, {**entry, "diff": name if diff else None}]
-        write_json(self.path / "provenance.json", {"processes": entries})
+        self._write_json("provenance.json", {"processes": entries})
 
     def describe(self, description: Description) -> None:
         """Write name, tags and parameters of this run for trackers."""
-        write_json(self.path / "run.json", vars(description))
+        self._write_json("run.json", vars(description))
 
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
         """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
+        if not self.writes:
+            return
         plain = {name: float(value) for name, value in values.items()}
         path = self.path / "metrics.jsonl"
         with naming_full_disk(path), path.open("ab") as file:
@@ -281,7 +297,7 @@ class RunFolder:
         found = self.lines()
         ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
         kept = (line.text() for line in found if line.step <= ends.get(line.kind, -1))
-        write_atomic(self.path / "metrics.jsonl", b"".join(kept))
+        self._write("metrics.jsonl", b"".join(kept))
         return found
 
     def figure_path(self, name: str) -> Path:
@@ -292,15 +308,15 @@ class RunFolder:
 
     def write_tables(self, tables: ResultTables) -> None:
         """Write the tables."""
-        write_json(self.path / "tables.json", tables.to_json())
+        self._write_json("tables.json", tables.to_json())
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Mark the run as finished; everything else must be written before."""
-        write_json(self.path / "result.json", result)
+        self._write_json("result.json", result)
 
     def mark(self, marker: Mapping[str, str]) -> None:
         """Write ``dataset.json``, which identifies the images."""
-        write_json(self.path / "dataset.json", marker)
+        self._write_json("dataset.json", marker)
 
 
 def runs_in(runs_dir: Path | str) -> list[RunFolder]:

@@ -26,7 +26,7 @@ class Group(NamedTuple):
 
 
 def group_from_environment() -> Group | None:
-    """The group of this process; None if it trains alone.
+    """Read the group of this process; None if it trains alone.
 
     SLURM_NTASKS is set in a batch script too, where one process runs and srun was not used.
     """

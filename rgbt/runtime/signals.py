@@ -11,7 +11,6 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -36,15 +35,9 @@ class Stopped(KeyboardInterrupt):
         return f"{WORDS[signal.Signals(self.number)]}{saved}; rerun the command to resume."
 
 
-@dataclass
-class _Signals:
-    """The first signal that came (0: none), and whether it waits."""
-
-    number: int = 0
-    is_deferred: bool = False
-
-
-_signals = _Signals()
+# Number of the first signal that came (0: none), and whether signals wait.
+_number = 0
+_is_deferred = False
 
 
 @contextmanager
@@ -63,15 +56,17 @@ def answered() -> Iterator[None]:
         for stream in terminals if number == signal.SIGHUP else ():  # closed: every write fails
             with Path(os.devnull).open("w") as nowhere:
                 os.dup2(nowhere.fileno(), stream)
-        if _signals.number == 0:
-            _signals.number = number
-            if not _signals.is_deferred:
+        global _number
+        if _number == 0:
+            _number = number
+            if not _is_deferred:
                 raise Stopped(number)
         elif number == signal.SIGINT:
             raise KeyboardInterrupt
 
-    global _signals
-    outer, _signals = _signals, _Signals()
+    global _number, _is_deferred
+    outer = _number, _is_deferred
+    _number, _is_deferred = 0, False
     before = {number: signal.getsignal(number) for number in WORDS}
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
@@ -81,7 +76,7 @@ def answered() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        _signals = outer
+        _number, _is_deferred = outer
 
 
 @contextmanager
@@ -97,12 +92,13 @@ def ending_command() -> Iterator[None]:
 @contextmanager
 def deferred() -> Iterator[None]:
     """Note signals; the one that came is raised on leaving, or by `at_once`."""
-    before, _signals.is_deferred = _signals.is_deferred, True
+    global _is_deferred
+    before, _is_deferred = _is_deferred, True
     try:
         with ending_command():  # processes that were started just now may end with an error
             yield
     finally:
-        _signals.is_deferred = before
+        _is_deferred = before
     if not before:
         raise_noted()
 
@@ -110,22 +106,24 @@ def deferred() -> Iterator[None]:
 @contextmanager
 def at_once() -> Iterator[None]:
     """Inside `deferred`: raise the signal that came, and others when they come."""
-    before, _signals.is_deferred = _signals.is_deferred, False
+    global _is_deferred
+    before, _is_deferred = _is_deferred, False
     try:
         raise_noted()
         yield
     finally:
-        _signals.is_deferred = before
+        _is_deferred = before
 
 
 def noted() -> int:
-    """Number of the signal that came; 0: none."""
-    return _signals.number
+    """Return the number of the signal that came; 0: none."""
+    return _number
 
 
 def raise_noted(number: int | None = None) -> None:
     """Raise `Stopped` for the signal that came, or for `number`, which another process noted."""
-    number = noted() if number is None else number
+    global _number
+    number = _number if number is None else number
     if number:
-        _signals.number = number
+        _number = number
         raise Stopped(number)

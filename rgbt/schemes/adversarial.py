@@ -25,7 +25,7 @@ CRITIC = "critic"
 
 @dataclass(kw_only=True, eq=False)
 class Adversarial:
-    """A segmentation phase and a discriminator phase, in every step or in alternating steps.
+    """Trains segmentation and discriminator, in every step or in alternating steps.
 
         segmentation    L_s(source) [+ L_s(target)] + weight w A
         discriminator   C = d(D(source), y_s) + d(D(target), y_t), halved on request
@@ -78,7 +78,7 @@ class Adversarial:
 
     @property
     def record(self) -> SchemeRecord:
-        """Labels of the target where they are read, confidence where it weighs."""
+        """Require labels of the target where they are read, confidence where it weighs."""
         labels = self.supervise_target
         setting = f"scheme.supervise_target={str(labels).lower()}"
         weighed = ("domains", "target_confidence", True, "scheme.weighed_by_confidence=true")
@@ -91,13 +91,13 @@ class Adversarial:
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """The segmentation's phases, then the discriminator's; or one of both kinds."""
+        """Yield the segmentation's phases, then the discriminator's; or one of both kinds."""
         seen: dict[str, Tensor] = {}
         released = self.idle_steps == "released"
         if self.alternates and batch.step % 2 == 0:
             with torch.no_grad():
-                for name, each in (("source", batch.source), ("target", batch.target)):
-                    output = self.passes.output(name, each, generator_of)
+                for name, images in (("source", batch.source), ("target", batch.target)):
+                    output = self.passes.output(name, images, generator_of)
                     seen[name] = judged_map(scores(output), self.judged)
             idle = tuple(self.passes.optimizers) if released else ()
             yield self._discriminator_phase(seen)._replace(idle=idle)
@@ -109,12 +109,12 @@ class Adversarial:
             yield phase._replace(idle=() if number else idle)
         self.others[CRITIC].requires_grad_(True)
         if not self.alternates:
-            yield self._discriminator_phase({name: each.detach() for name, each in seen.items()})
+            yield self._discriminator_phase({name: seen[name].detach() for name in seen})
 
     def _domain(
         self, name: str, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Loss parts of a domain; the input of the discriminator is appended to `seen`."""
+        """Compute loss parts of a domain, and add the input of the discriminator to `seen`."""
         is_source = name == "source"
         own = batch.source if is_source else batch.target
         parts: dict[str, Tensor] = {}
@@ -137,5 +137,7 @@ class Adversarial:
     def _discriminator_phase(self, seen: Mapping[str, Tensor]) -> Phase:
         share = 0.5 if self.halved else 1.0
         critic = self.others[CRITIC]
-        costs = {name: self.cost_of(critic(each), self.values[name]) for name, each in seen.items()}
-        return Phase((CRITIC,), {f"{CRITIC}/{name}": share * cost for name, cost in costs.items()})
+        parts = {}
+        for name, maps in seen.items():
+            parts[f"{CRITIC}/{name}"] = share * self.cost_of(critic(maps), self.values[name])
+        return Phase((CRITIC,), parts)

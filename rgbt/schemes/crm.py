@@ -52,7 +52,7 @@ class CRM:
 
     @property
     def record(self) -> SchemeRecord:
-        """A network of all views in one pass; where something is distilled, a masked pass."""
+        """Require all views in one pass; where something is distilled, a masked pass."""
         distilled = ("complementary_weight", "nonlocal_weight")
         weights = {name: getattr(self, name) for name in distilled}
         return SchemeRecord(
@@ -68,12 +68,12 @@ class CRM:
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase: the criterion of the supervised passes and the distillation terms."""
+        """Yield one phase: the losses of the supervised passes and the distillation terms."""
         # This is a function of its own, so that the backward pass does not keep the mask logits.
         yield Phase(("main",), self._parts(batch, generator_of))
 
     def _parts(self, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
-        """Weighted parts of the loss, from passes stacked in the order F R T F' R' T'."""
+        """Compute weighted loss parts, from passes stacked in the order F R T F' R' T'."""
         modality = [self.modality_weight] * (len(self.views) - 1)
         weights = torch.tensor([1.0, *modality, *[1.0] * self.hides_cells]).to(batch.rgb.device)
         supervised = len(weights)  # the first ones

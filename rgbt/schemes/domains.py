@@ -43,26 +43,26 @@ class SourceAndTarget(Protocol):
 
 
 def draw_masks(masker: AnyMasker, batch: Batch, generator: torch.Generator) -> MaskPair:
-    """Hidden cells (B, h, w) of this process' samples; the masker draws for those of all."""
+    """Draw hidden cells (B, h, w) for all processes; returns those of this one's samples."""
     height, width = batch.rgb.shape[-2:]
     masks = masker((height, width), whole(batch.centre_yx), generator)
     return MaskPair(*(own(mask) for mask in masks))
 
 
 def options_of(domain: ViewAndHead) -> dict[str, Any]:
-    """Keyword arguments of the network for a domain, without those that are None."""
+    """Return keyword arguments of the network for a domain, without those that are None."""
     given = {"views": domain.view and (domain.view,), "head": domain.head}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def scores(output: Output) -> Tensor:
-    """(B, K, H, W) class scores of an output."""
+    """Return the (B, K, H, W) class scores of an output."""
     assert output.logits is not None, "the record requires scores"
     return output.logits
 
 
 class Passes:
-    """The passes of both domains through the network, and their losses.
+    """Makes the passes of both domains through the network, and their losses.
 
     `optimizers` has the beginnings of parameters that each leaves out, by name. With a head for
     each domain, one optimiser per domain, which share all but the heads (thesis, Sec. III-B); else
@@ -85,7 +85,7 @@ class Passes:
     def record_with(
         self, *requires: Requirement, masked: Requirement = WHOLE_IMAGES, **provides: Any
     ) -> SchemeRecord:
-        """The record of a scheme of two domains and class scores; the masker must be `masked`."""
+        """Return the record of a scheme of two domains and class scores, with a `masked` masker."""
         heads = ("domains", "separate_heads", True, f"scheme.gradients={self.gradients}")
         return SchemeRecord(
             requires=(
@@ -109,7 +109,7 @@ class Passes:
         masks: MaskPair | None = None,
         network: nn.Module | None = None,
     ) -> Output:
-        """The output of the model, or of `network`, for a batch of "source" or "target"."""
+        """Return the output of the model, or of `network`, for a batch of "source" or "target"."""
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
         # A pass with masks has draws of its own.
@@ -120,13 +120,13 @@ class Passes:
     def supervised(
         self, name: str, batch: Batch, generator_of: GeneratorOf
     ) -> tuple[Output, dict[str, Tensor]]:
-        """The output, and weighted parts of the loss named ``<domain>/<part>``."""
+        """Return the output, and weighted parts of the loss named ``<domain>/<part>``."""
         output = self.output(name, batch, generator_of)
         parts = self.loss(output, batch, generator_of(f"{name} loss"))
         return output, {f"{name}/{part}": values.sum() for part, values in parts.items()}
 
     def phases(self, cost: Callable[[str], dict[str, Tensor]]) -> Iterator[Phase]:
-        """A step that costs what is computed for "source" and then for "target"."""
+        """Yield the phases of a step with the costs of "source" and then of "target"."""
         if len(self.optimizers) == 1 or self.gradients == "together":
             yield Phase(tuple(self.optimizers), cost("source") | cost("target"))
             return

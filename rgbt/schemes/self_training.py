@@ -35,7 +35,7 @@ Normalisation = Literal["batch", "running"]
 
 
 class Teacher:
-    """The moving average w' of the parameters w of a network, before the update of step t.
+    """Keeps the moving average w' of the parameters w of a network, before step t.
 
         w' <- a w' + (1 - a) w,   a = min(1 - 1 / (t + 1), decay),   t = 0, 1, ...
 
@@ -57,7 +57,7 @@ class Teacher:
             self.average.update(self._student[0], max(1 / (step + 1), 1 - self._decay))
 
     def network(self) -> nn.Module:
-        """The teacher, ready to predict; normalisations that the student froze stay frozen."""
+        """Return the teacher, ready to predict; normalisations that the student froze stay so."""
         teacher = self.average.module.eval()
         if self._normalisation == "batch":
             both = zip(teacher.modules(), self._student[0].modules(), strict=True)
@@ -121,7 +121,7 @@ class SelfTraining:
 
     @property
     def record(self) -> SchemeRecord:
-        """No labels of the target, weighted pixels, and what is read of masks and features."""
+        """Require no labels of the target, weighted pixels, and what masks and features need."""
         setting = f"scheme.masked_weight={self.masked_weight:g}"
         distance = self.feature_distance
         return self.passes.record_with(
@@ -133,7 +133,7 @@ class SelfTraining:
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser, of images in [0, 1]."""
+        """Yield one phase, or one per optimiser, of images in [0, 1]."""
         self.teacher.update(batch.step)
         with torch.no_grad():
             network = self.teacher.network()
@@ -178,7 +178,7 @@ class SelfTraining:
         return parts
 
     def _masked(self, name: str, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
-        """Parts of masked images; those of two domains have half of the weight each."""
+        """Compute parts of masked images; those of two domains have half of the weight each."""
         masks = draw_masks(self.masker, batch, generator_of(f"{name} mask"))
         output = self.passes.output(name, batch, generator_of, masks)
         parts = self.loss(output, batch, generator_of(f"{name} masked loss"))
@@ -191,7 +191,7 @@ class SelfTraining:
 
 
 def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
-    """(B, H, W) bool: the pixels of half of the classes, drawn for every image.
+    """Draw half of the classes for every image; returns their pixels, (B, H, W) bool.
 
     With n values in the labels of the batch, 255 among them, ceil(n / 2) are drawn for each image,
     without replacement. A drawn value that the image does not have pastes nothing.
@@ -213,7 +213,7 @@ def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
-    """The target with the pixels `pasted` (B, H, W) of the source, which have weight 1."""
+    """Paste the pixels `pasted` (B, H, W) of the source on the target; they have weight 1."""
     assert target.confidence is not None, "pseudo-labels have a weight"
     return replace(
         target,
@@ -225,7 +225,7 @@ def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
 
 
 def seen_as(batch: Batch, own: View | None, other: View | None) -> Batch:
-    """The batch with what its domain sees, in the channels that another domain sees.
+    """Move what the domain of a batch sees to the channels that another domain sees.
 
     RGB becomes thermal as its luma; thermal becomes RGB as grey; else it stays as it is.
     """

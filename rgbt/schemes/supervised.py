@@ -24,7 +24,7 @@ class Supervised:
     record: ClassVar[SchemeRecord] = SchemeRecord(shows_views=True)
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of the loss."""
+        """Yield one phase with the parts of the loss."""
         masks = None
         if record_of(self.masker, MaskerRecord).hides_cells:
             masks = draw_masks(self.masker, batch, generator_of("mask"))

@@ -29,7 +29,7 @@ from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
 @dataclass(kw_only=True, eq=False)
 class Temporal:
-    """Losses of a frame, of its virtual successor, and of the agreement of their predictions.
+    """Trains a frame, its virtual successor, and the agreement of their predictions.
 
     Both frames go through the same weights. Where the network normalises over the batch they go
     one after the other, as released; else as one batch, which is the same function and faster.
@@ -57,7 +57,7 @@ class Temporal:
 
     @property
     def record(self) -> SchemeRecord:
-        """A loss of two frames, whole images, and class scores of both."""
+        """Require a loss of two frames, whole images, and class scores of both."""
         makes_masks = record_of(self.model, NetworkRecord).outputs == "masks"
         half = Requirement("loss", "compares_half", True, "scheme.resolution=half")
         return SchemeRecord(
@@ -66,14 +66,14 @@ class Temporal:
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
                 *((half,) if self.resolution == "half" else ()),
-                *(each.inside("scheme") for each in record_of(self.view, Record).requires),
+                *(needed.inside("scheme") for needed in record_of(self.view, Record).requires),
             ),
             frames=2,
             camera=self.view.camera,
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of Eq. 4."""
+        """Yield one phase with the parts of Eq. 4."""
         image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
         generator = generator_of("virtual view")
         angles = own_draw(lambda count: self.view.draw(count, generator), len(batch.name))
@@ -89,7 +89,7 @@ class Temporal:
         yield Phase(("main",), parts)
 
     def _warped(self, logits: Tensor, warp: Warp) -> Tensor:
-        """Class probabilities of the first frame, as the second sees them."""
+        """Warp class probabilities of the first frame to the second."""
         scores = (logits.detach() if self.detach else logits).float()
         if self.resolution == "half":
             scores = halved_mean(scores)
@@ -119,10 +119,10 @@ class Temporal:
         return frames
 
     def _part(self, output: Output, number: int, count: int) -> Output:
-        """What is of one of two frames."""
+        """Take the part of one of two frames from their common output."""
         if self.stacks:  # (L, P = 2, B, ...)
             one_pass = slice(number, number + 1)
-            return Output(None, {name: each[:, one_pass] for name, each in output.aux.items()})
+            return Output(None, {name: map_[:, one_pass] for name, map_ in output.aux.items()})
         part = slice(number * count, (number + 1) * count)
         assert output.logits is not None, "a network that does not stack passes has scores"
-        return Output(output.logits[part], {name: each[part] for name, each in output.aux.items()})
+        return Output(output.logits[part], {name: map_[part] for name, map_ in output.aux.items()})

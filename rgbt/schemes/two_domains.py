@@ -18,7 +18,7 @@ from rgbt.types import IGNORE, GeneratorOf, Loss, Phase, TwoDomains
 
 @dataclass(kw_only=True, eq=False)
 class LabelledDomains:
-    """Segmentation of both domains with the labels of each; `loss` is that of one domain.
+    """Trains segmentation of both domains with labels; `loss` is that of one domain.
 
     Source: thesis (J. Sun), Sec. III-B, first stage; also HeatNet's students and first stage.
     Released (thesis): the gradients "kept".
@@ -34,11 +34,11 @@ class LabelledDomains:
 
     @property
     def record(self) -> SchemeRecord:
-        """Labels of the target, beside what two domains require."""
+        """Require labels of the target, beside what two domains require."""
         return self.passes.record_with(Requirement("domains", "target_labels", True))
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser."""
+        """Yield one phase, or one per optimiser."""
         batches = {"source": batch.source, "target": batch.target}
         yield from self.passes.phases(
             lambda name: self.passes.supervised(name, batches[name], generator_of)[1]
@@ -47,7 +47,7 @@ class LabelledDomains:
 
 @dataclass(kw_only=True, eq=False)
 class UnlabelledTarget:
-    """Segmentation of the source, and a loss without labels on the target.
+    """Trains segmentation of the source, and a loss without labels on the target.
 
     `unlabelled` maps the probabilities (B, K, H, W) of the target to named, weighted scalars; the
     auxiliary head may also be trained with the guidance of both heads (`guidance`).
@@ -67,13 +67,13 @@ class UnlabelledTarget:
 
     @property
     def record(self) -> SchemeRecord:
-        """No labels of the target; for guidance, an auxiliary head."""
+        """Require no labels of the target; for guidance, an auxiliary head."""
         setting = f"scheme.guidance_weight={self.guidance_weight:g}"
         guided = (Requirement("model", "auxiliary", True, setting),) if self.guidance_weight else ()
         return self.passes.record_with(Requirement("domains", "target_labels", False), *guided)
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser."""
+        """Yield one phase, or one per optimiser."""
         yield from self.passes.phases(lambda name: self._cost(name, batch, generator_of))
 
     def _cost(self, name: str, batch: TwoDomains, generator_of: GeneratorOf) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 A finished upstream run is used as it is. An interrupted one is resumed, and the command waits for
 one that another process trains. Of several processes, which torchrun or srun start, process 0 looks
-at files, and the others do as it found (`agreed`).
+at files for all of them (`computed_once`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from contextlib import contextmanager
 import torch
 from torch import distributed
 
+from rgbt.assembly.training_setup import validate
 from rgbt.checks import InputError, RunError
 from rgbt.cores import sleep_while_waiting
 from rgbt.data.loaders import check_batch_size
@@ -25,13 +26,13 @@ from rgbt.engine.batch_norm import check_batch_norm_parts
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.settings import TrainerSettings
 from rgbt.files.plain_files import check_links
-from rgbt.processes import agreed, num_processes, rank
+from rgbt.processes import computed_once, num_processes
 from rgbt.runs.provenance import other_code
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.group import Group, group_from_environment
 from rgbt.runtime.signals import WORDS, Stopped
 from rgbt.terminal import info, warn
-from rgbt.training.train import Training
+from rgbt.training.train import predict_labels, train_run
 
 # Part of every error message about a lost connection between CPUs.
 LOST_CONNECTION = "gloo/transport"
@@ -65,7 +66,7 @@ def start(run: RunSpec, extra_tags: Mapping[str, str], words: Sequence[str]) -> 
 
 
 def _num_devices(trainer: TrainerSettings) -> int:
-    """Devices of this machine that a run uses: `trainer.devices`, where "auto" means all GPUs."""
+    """Count the devices that a run uses: `trainer.devices`, where "auto" means all GPUs."""
     found = torch.cuda.device_count() if trainer.accelerator in ("auto", "cuda") else 0
     if trainer.devices == "auto":
         return max(1, found)
@@ -118,10 +119,13 @@ def launch(num_processes: int, words: Sequence[str]) -> int:
         preferred["GLOO_SOCKET_IFNAME"] = "lo"
     for name, value in preferred.items():
         os.environ.setdefault(name, value)
-    heard = [each.name for each in WORDS if signal.getsignal(each) is not signal.SIG_IGN]  # nohup
-    options = [f"--signals-to-handle={','.join(heard)}", f"--shutdown-timeout={SHUTDOWN_S}"]
-    known = get_args_parser().format_help()  # older versions of torch have neither
-    options = [each for each in options if each.partition("=")[0] in known]
+    heard = [sent.name for sent in WORDS if signal.getsignal(sent) is not signal.SIG_IGN]  # nohup
+    options = []
+    known = get_args_parser().format_help()  # older versions of torch have neither of these
+    if "--signals-to-handle" in known:
+        options.append(f"--signals-to-handle={','.join(heard)}")
+    if "--shutdown-timeout" in known:
+        options.append(f"--shutdown-timeout={SHUTDOWN_S}")
     options += ["--standalone", "--local-addr=127.0.0.1", f"--nproc-per-node={num_processes}"]
     try:
         main([*options, "-m", "rgbt.run", *words])
@@ -145,33 +149,42 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
         extra_tags: MLflow tags of the requested run; its upstream runs do not get them.
 
     Raises:
-        InputError: see `Training`; the message names the upstream run that is wrong.
+        InputError: see `train_run`; the message names the upstream run that is wrong.
     """
-    for each in run.dependencies:
-        folder = each.run.folder
+    for dependency in run.dependencies:
+        folder = dependency.run.folder
         check_links(folder)
-        # fresh=true does not repeat them
-        if run.fresh and each.run.is_finished and (made_by := other_code(folder)) is not None:
+        if not (run.fresh and dependency.run.is_finished):
+            continue
+        made_by = other_code(folder)
+        if made_by is not None:  # fresh=true does not repeat it
             warn(
-                f"the upstream run {folder} ({each.key}) was trained by other code ({made_by}) and "
-                f"is used as it is. To train it again, run +experiment={each.run.name} with "
-                "fresh=true."
+                f"the upstream run {folder} ({dependency.key}) was trained by other code "
+                f"({made_by}) and is used as it is. To train it again, run "
+                f"+experiment={dependency.run.name} with fresh=true."
             )
-    specs: tuple[RunSpec, ...] = agreed(run.pending)
-    is_incomplete = len(specs) > 1 or bool(run.dependencies and run.missing_labels)
-    for spec in specs if is_incomplete and rank() == 0 else ():
+    for spec in computed_once(lambda: _validated(run)):
         with _naming(spec, run):
-            Training(spec).validate()
-    for spec in specs:
-        with _naming(spec, run):
-            if spec.dependencies and rank() == 0:
-                Training(spec).predict_labels()
             if spec.dependencies:
-                agreed(None)  # process 0 has written the labels
+                _predict_labels(spec)
             if spec.key == run.key:
-                Training(spec, extra_tags).complete()
+                train_run(spec, extra_tags)
             else:
                 _train_upstream(spec, run.name)
+
+
+def _validated(run: RunSpec) -> tuple[RunSpec, ...]:
+    """Return the runs to train in order, after validating several, or one that lacks labels."""
+    specs = run.pending
+    if len(specs) > 1 or (run.dependencies and run.missing_labels):
+        for spec in specs:
+            with _naming(spec, run):
+                validate(spec)
+    return specs
+
+
+def _predict_labels(spec: RunSpec) -> None:
+    computed_once(lambda: predict_labels(spec))
 
 
 @contextmanager
@@ -188,7 +201,7 @@ def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
 def _train_upstream(spec: RunSpec, downstream: str) -> None:
     is_waiting = False
     while True:
-        is_finished, is_locked = agreed((spec.is_finished, spec.is_locked))
+        is_finished, is_locked = computed_once(lambda: (spec.is_finished, spec.is_locked))
         if is_finished:
             return
         if is_locked:
@@ -198,7 +211,7 @@ def _train_upstream(spec: RunSpec, downstream: str) -> None:
             time.sleep(POLL_S)
             continue
         try:
-            Training(spec, upstream_of=downstream).complete()
+            train_run(spec, upstream_of=downstream)
         except InputError:
             # Another process may have started it since the look, and even finished it.
             if num_processes() > 1 or not (spec.is_finished or spec.is_locked):

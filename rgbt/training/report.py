@@ -76,27 +76,29 @@ def announce_network(session: Session) -> None:
 
 
 def device_line(session: Session) -> str:
-    """The device with its precision: "cpu, 2 threads, 32-true"."""
+    """Write the device with its precision: "cpu, 2 threads, 32-true"."""
     import torch
 
     from rgbt.processes import num_processes
 
     device, number = session.device, num_processes()
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
-    threads = f"{(n := torch.get_num_threads())} thread{'s' * (n > 1)}"
-    name, each = (f"{number} x {device.type}", " each") if number > 1 else (f"{device}", "")
-    return f"{name}{gpu}, {threads}{each}, {session.trainer.precision}"
+    count = torch.get_num_threads()
+    threads = f"{count} thread{'s' * (count > 1)}"
+    if number > 1:
+        return f"{number} x {device.type}{gpu}, {threads} each, {session.trainer.precision}"
+    return f"{device}{gpu}, {threads}, {session.trainer.precision}"
 
 
 def network_line(session: Session) -> str:
-    """Class and number of parameters: "Mask2Former, 1.23 M parameters", and of trained ones."""
+    """Write class and number of parameters: "Mask2Former, 1.23 M parameters", and trained ones."""
     every, trained = _millions(session.model), _millions(session.model, only_trained=True)
     of_which = f", {trained} trained" if trained != every else ""
     return f"{type(session.model).__name__}, {every} parameters{of_which}"
 
 
 def _of_steps(setup: TrainingSetup) -> str:
-    """Batch, epochs and validation: "of batch 2 (6 epochs), validated every 3"."""
+    """Write batch, epochs and validation: "of batch 2 (6 epochs), validated every 3"."""
     session, trainer = setup.session, setup.session.trainer
     batch = session.loading.batch_size * trainer.accumulate
     epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch
@@ -112,8 +114,11 @@ def _write(*lines: str) -> None:
 
 
 def _millions(network: nn.Module, *, only_trained: bool = False) -> str:
-    parameters = (p for p in network.parameters() if p.requires_grad or not only_trained)
-    return f"{sum(each.numel() for each in parameters) / 1e6:.2f} M"
+    count = 0
+    for parameter in network.parameters():
+        if parameter.requires_grad or not only_trained:
+            count += parameter.numel()
+    return f"{count / 1e6:.2f} M"
 
 
 def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
@@ -133,8 +138,8 @@ def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         "another value of seed=..."
     )
     # A point of a grid may be the default of an experiment: the longer name says what it varies.
-    lengths = [len(each.tags.get(GROUP, "")) for each in (requested, known)]
-    named = requested if lengths[0] > lengths[1] else known
+    is_longer = len(requested.tags.get(GROUP, "")) > len(known.tags.get(GROUP, ""))
+    named = requested if is_longer else known
     merged = Description(named.name, {**known.tags, **named.tags}, known.params)
     tracking.refresh(folder, merged)
     warn_of_result(folder.path)

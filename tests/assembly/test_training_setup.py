@@ -20,7 +20,7 @@ from rgbt.config.compose import compose
 from rgbt.data import rare_classes
 from rgbt.data.labels import classes_in
 from rgbt.data.pseudo_labels import FORMAT
-from rgbt.engine.device import Recomputed
+from rgbt.engine.device import TrainingForward
 from rgbt.files.plain_files import write_json
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec
@@ -213,7 +213,7 @@ def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> N
     plain, expected = first_loss()
     network, loss = first_loss("trainer.activation_checkpointing=true")
     assert torch.equal(loss, expected)
-    assert isinstance(network.get_submodule("conv1_rgb").forward, Recomputed)
+    assert isinstance(network.get_submodule("conv1_rgb").forward, TrainingForward)
     network, loss = first_loss("trainer.memory_format=channels_last")
     torch.testing.assert_close(loss, expected, rtol=1e-4, atol=0)
     assert not network.get_parameter("conv2_1_rgb.conv.weight").is_contiguous()

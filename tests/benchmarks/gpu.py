@@ -26,7 +26,7 @@ import torch
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import WAIT_SHARE, Trainer
+from rgbt.engine.trainer import WAIT_SHARE, Hooks, Trainer
 from rgbt.runs.specify import specify
 
 WARM, STEPS, NEVER = 3, 8, 1_000_000
@@ -110,18 +110,19 @@ def measure(setup: TrainingSetup, folder: Path, *, loading: bool) -> dict[str, f
     """Images per second, milliseconds a step, peak memory, and the share of waiting for images."""
     session = setup.session
     recorded: list[dict[str, float]] = []
+    hooks = Hooks()
+    hooks.log = lambda step, values: recorded.append(values)  # type: ignore[method-assign]
     trainer = Trainer(
         fabric=setup.fabric,
         settings=session.trainer,
-        scheme=setup.scheme,
+        phases=setup.scheme.phases,
         model=setup.model,
         others=setup.others,
         optimizers=setup.optimizers,
         schedule=setup.schedule,
         steps_per_epoch=NEVER,
         folder=folder,
-        record=lambda step, values: recorded.append(dict(values)),
-        validate=lambda step: 0.0,
+        hooks=hooks,
     )
     batches: Iterator[Any] = setup.batches(range(WARM + STEPS + 1))
     if not loading:
@@ -141,7 +142,7 @@ def measure(setup: TrainingSetup, folder: Path, *, loading: bool) -> dict[str, f
         "images/s": size / step,
         "ms a step": 1e3 * step,
         "peak MiB": peak,
-        "waiting": median(each.get(WAIT_SHARE, 0.0) for each in recorded[WARM:]),
+        "waiting": median(values.get(WAIT_SHARE, 0.0) for values in recorded[WARM:]),
     }
 
 

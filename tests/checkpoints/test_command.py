@@ -120,7 +120,7 @@ def test_published_files_fit_the_networks_of_the_table(tmp_path: Path) -> None:
 
 def test_every_experiment_has_one_recipe() -> None:
     for name in available("experiment"):
-        found = [r for r in RECIPES if any(fnmatchcase(name, each) for each in r.experiments)]
+        found = [r for r in RECIPES if any(fnmatchcase(name, pattern) for pattern in r.experiments)]
         assert len(found) == (not name.startswith("start_")), name  # those are of scale=bench
 
 

@@ -103,7 +103,7 @@ def test_thermal_stem_of_rtfnet_is_mean_or_drawn_anew(tmp_path: Path) -> None:
     tensors["conv1.weight"] = stem
     path, key = saved(tmp_path, tensors), "encoder_thermal_conv1.weight"
     released, drawn = (
-        network("rtfnet_18", base_width=4, thermal_stem=each) for each in ("rgb_mean", "xavier")
+        network("rtfnet_18", base_width=4, thermal_stem=stem) for stem in ("rgb_mean", "xavier")
     )
     before = drawn.state_dict()[key].clone()
     plan = load_weights(released, path)
@@ -185,7 +185,9 @@ def test_released_names_of_cmnext(tmp_path: Path) -> None:
 def test_conventions_follow_from_the_file(tmp_path: Path) -> None:
     state = like(network("cmx_tiny").state_dict())
     voting = named({"voting.weight": (9, 18, 3, 3), "voting.bias": (9,)})
-    cmx, temporal = (planned(tmp_path, "cmx_tiny", each) for each in (state, {**state, **voting}))
+    cmx, temporal = (
+        planned(tmp_path, "cmx_tiny", content) for content in (state, {**state, **voting})
+    )
     assert (cmx.unused, temporal.unused) == ([], ["voting.bias", "voting.weight"])
     assert cmx.convention == ("model/inputs=cmx_released", "model.decoder_norm_eps_eval=1e-5")
     assert temporal.convention == ("model/inputs=temporal",)

@@ -53,7 +53,7 @@ def test_round_trip(tmp_path: Path, yaml: str, changes: dict[str, int], layout: 
     expected = model.state_dict()
     for key, value in other.state_dict().items():
         assert torch.equal(value, expected[key]), key
-    assert [each.name for each in path.parent.iterdir()] == ["file"]
+    assert [file.name for file in path.parent.iterdir()] == ["file"]
     has_place = layout == "safetensors" or yaml[:3] in ("mas", "cmx", "sem")
     assert plan.contents.note == (NOTE if has_place else {})
     assert plan.inputs == ({"rgb_order": "rgb"} if has_place else None)
@@ -96,4 +96,4 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="already exists"):
         save(tmp_path / "file", "safetensors", "cmx", state, {})
     assert (tmp_path / "file").read_text() == "dear"
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]

@@ -23,8 +23,9 @@ from rgbt import evaluate
 from rgbt.checkpoints.files import read, save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import (
-    Checkpoints,
     State,
+    commit,
+    load_best,
     load_checkpoint,
     restore_optimizer,
     restore_weights,
@@ -84,7 +85,7 @@ def variants(content: bytes, number: int) -> Iterator[bytes]:
     """Damaged bytes, entries with exchanged contents, other comments."""
     draw = random.Random(17)
     with zipfile.ZipFile(BytesIO(content)) as archive:
-        entries = {each.filename: archive.read(each) for each in archive.infolist()}
+        entries = {entry.filename: archive.read(entry) for entry in archive.infolist()}
         comment = archive.comment
     sizes = Counter(len(value) for name, value in entries.items() if "/data/" in name)
     alike = [name for name in entries if "/data/" in name and sizes[len(entries[name])] > 1]
@@ -168,7 +169,7 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     code, _, err = call(evaluate.entry, *evaluated)
     assert code == 0, err
     counts = Counts.load(tmp_path / "counts.npz"), RunResult(folder).counts()
-    assert [each.measurement.run for each in counts] == [first.name] * 2
+    assert [of_split.measurement.run for of_split in counts] == [first.name] * 2
     (tmp_path / "counts.npz").unlink()
     config = folder / "config.yaml"
     stored = config.read_text()
@@ -187,11 +188,10 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     with pytest.raises(InputError, match=f"counts of the run {other.name}"):
         RunResult(folder).counts()
     state = State(seed=3, step=7, best_step=7, key="a", settings="b")
-    run = Checkpoints(tmp_path / "a")
-    run.commit(payload() | {"state": asdict(state)}, state)
-    assert run.load_best(state).keys() == payload()["model"].keys()
+    commit(tmp_path / "a", payload() | {"state": asdict(state)}, state)
+    assert load_best(tmp_path / "a", state).keys() == payload()["model"].keys()
     with pytest.raises(RunError, match="belongs to the run a, not to c"):
-        run.load_best(replace(state, key="c"))
+        load_best(tmp_path / "a", replace(state, key="c"))
 
 
 def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +206,7 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(OSError, match="No space"):
         save(path, payload())
     assert path.read_bytes() == before
-    assert [each.name for each in tmp_path.iterdir()] == ["last.pt"]
+    assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
 
 
 def exchanged(node: dict[str, Any], key: Any, value: Any = None) -> None:

@@ -21,6 +21,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.data import loaders
 from rgbt.data.loaders import (
     Batches,
+    Examples,
     LoadedBatch,
     LoaderSettings,
     PairedBatches,
@@ -32,7 +33,6 @@ from rgbt.data.loaders import (
 from rgbt.data.mfnet import MFNet
 from rgbt.data.rare_classes import (
     RareClasses,
-    RareClassExamples,
     class_probabilities,
     count_rare_classes,
 )
@@ -61,11 +61,11 @@ def dataset(write_mfnet) -> MFNet:
 
 def trained(
     dataset: MFNet, steps: range, seed: int = 7, split: str = "train", **changes: object
-) -> Batches[Any]:
+) -> Batches:
     return train_batches(dataset, split, crm(), settings(**changes), seed, steps)
 
 
-def evaluated(dataset: MFNet, **changes: object) -> Batches[Batch]:
+def evaluated(dataset: MFNet, **changes: object) -> Batches:
     return eval_batches(dataset, "val", crm(test_short_edge=12), settings(**changes))
 
 
@@ -86,12 +86,12 @@ def damage(dataset: MFNet, *names: str) -> None:
 
 def assert_equal(found: Iterable[Any], expected: Iterable[Any]) -> None:
     for one, other in zip(found, expected, strict=True):
-        for each in dataclasses.fields(one):
-            a, b = getattr(one, each.name), getattr(other, each.name)
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
             if dataclasses.is_dataclass(a):
                 assert_equal([a], [b])
             else:
-                assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
+                assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, field.name
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -246,7 +246,7 @@ def test_more_workers_than_cores_are_no_warning(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     next(trained(dataset, range(1), num_workers=2))
-    assert not [each for each in recwarn if "worker" in str(each.message)]
+    assert not [warning for warning in recwarn if "worker" in str(warning.message)]
 
 
 def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,7 +278,7 @@ def test_batches_are_prefetched_and_pinned(
     locked: list[torch.Tensor] = []  # pages are locked on machines with a GPU alone
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: locked.append(self) or self)
     LoadedBatch(batch).pin_memory()
-    assert len(locked) == sum(isinstance(each, torch.Tensor) for each in vars(batch).values())
+    assert len(locked) == sum(isinstance(value, torch.Tensor) for value in vars(batch).values())
     assert LoadedBatch(error="why").pin_memory().error == "why"
 
 
@@ -360,13 +360,9 @@ def test_crop_is_drawn_again_until_it_shows_enough(
         return SimpleNamespace(label=np.repeat(sample, next(left)))
 
     drawn, _ = rare.draw(numpy_generator(3, "rare class", 0, 5))
-    source: Any = SimpleNamespace(
-        names=list(PIXELS),
-        first_readable=lambda names, skipped: drawn,
-        transform=SimpleNamespace(train=make),
-        seed=3,
-    )
-    RareClassExamples(source, rare)((0, 5), {})
+    dataset: Any = SimpleNamespace(read=lambda name: drawn)
+    transform: Any = SimpleNamespace(train=make)
+    Examples(dataset, tuple(PIXELS), transform, False, 3, rare).train((0, 5), {})
     assert len(set(seen)) == len(seen) == calls
     # The draws of the augmentation are those of (seed, "augment", epoch, number) alone, and not
     # those that have chosen the class.

@@ -73,8 +73,8 @@ def test_resume_with_averaging_equals_straight_through(tmp_path: Path, averaging
     assert second.resume(state)
     second.fit(batches(state.step), state)
     for name in ("last.pt", "best.pt"):
-        one, other = (load_checkpoint(tmp_path / each / name) for each in "ab")
-        assert same(one, other), name
+        ends = [load_checkpoint(tmp_path / run / name) for run in "ab"]
+        assert same(*ends), name
 
 
 def test_checkpoints_hold_what_was_evaluated_and_what_resumes(tmp_path: Path) -> None:
@@ -83,14 +83,15 @@ def test_checkpoints_hold_what_was_evaluated_and_what_resumes(tmp_path: Path) ->
     plain = make_two(tmp_path / "plain")
     seen: list[Tensor] = []
 
-    def validate(step: int) -> float:
-        seen.append(next(trainer.weights.network.parameters()).clone())
+    def evaluate(step: int, network: nn.Module) -> float:
+        seen.append(next(network.parameters()).clone())
         return float(step)
 
-    trainer.validate = validate
-    for each in (trainer, plain):
-        each.fit(batches(0), State(seed=7))
-    losses = [[values["loss"] for _, values in each.log] for each in (trainer, plain)]
+    trainer.hooks.evaluate = evaluate
+    losses = []
+    for run in (trainer, plain):
+        run.fit(batches(0), State(seed=7))
+        losses.append([values["loss"] for _, values in run.log])
     assert losses[0] == losses[1]
     last, best = (load_checkpoint(tmp_path / "ema" / name) for name in ("last.pt", "best.pt"))
     own = load_checkpoint(tmp_path / "plain/last.pt")

@@ -11,7 +11,7 @@ from torch import nn
 from rgbt.checkpoints.files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine import checkpoint
-from rgbt.engine.checkpoint import Checkpoints, State, load_checkpoint, restore_weights
+from rgbt.engine.checkpoint import State, load_checkpoint, load_last, restore_weights
 from tests.engine.test_trainer import batches, make
 
 COUNTS = "counts_val.npz"
@@ -23,12 +23,12 @@ def run(folder: Path, scores: dict[int, float]) -> State:
     trainer, _ = make(folder, eval_every=2, checkpoint_every=1)
     latest: list[str] = []
 
-    def validate(step: int) -> float:
+    def evaluate(step: int, _: nn.Module) -> float:
         latest.append(f"step {step}: {scores[step]}")
         return scores[step]
 
-    trainer.validate = validate
-    trainer.keep = lambda: (folder / COUNTS).write_text(latest[-1])
+    trainer.hooks.evaluate = evaluate
+    trainer.hooks.keep = lambda: (folder / COUNTS).write_text(latest[-1])
     state = State(seed=0)
     trainer.resume(state)
     trainer.fit(batches(state.step), state)
@@ -58,7 +58,7 @@ def test_killed_while_the_best_is_saved_makes_it_again(
         patch.setattr(checkpoint, "save", dying)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path, RISING)
-    _, state = Checkpoints(tmp_path).load()
+    _, state = load_last(tmp_path)
     assert (state.step, state.best_step) == (3, 2)
     assert load_checkpoint(tmp_path / "best.pt")["step"] == best
     state = run(tmp_path, RISING)
@@ -85,7 +85,7 @@ def test_damaged_checkpoints_are_refused(tmp_path: Path, name: str, how: str) ->
         assert run(tmp_path, RISING).step == 6, "the run begins anew"
         return
     with pytest.raises(RunError, match="; remove the folder and rerun"):
-        Checkpoints(tmp_path).load()
+        load_last(tmp_path)
 
 
 def test_finished_training_keeps_three_files_and_trains_no_more(tmp_path: Path) -> None:

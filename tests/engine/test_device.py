@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import restore_optimizer
-from rgbt.engine.device import Recomputed, fix_threads, place, prepare_training
+from rgbt.engine.device import TrainingForward, fix_threads, place, prepare_training
 from rgbt.engine.optimizers import AdamW
 from rgbt.engine.settings import TrainerSettings
 from rgbt.requirements import NetworkRecord
@@ -126,7 +126,7 @@ def own(*recomputed: str) -> nn.Module:
 def test_recomputation_that_is_impossible_is_refused(recomputed, changes, words: str) -> None:
     net = own("blocks.*")  # a star stands for one part of a name
     prepare_training(net, settings(activation_checkpointing=True))
-    found = [isinstance(each.forward, Recomputed) for each in net.modules()]
+    found = [isinstance(module.forward, TrainingForward) for module in net.modules()]
     assert found == [False, False, True, True]
     with pytest.raises(InputError, match=f"activation_checkpointing: .*{words}"):
         prepare_training(own(*recomputed), settings(activation_checkpointing=True, **changes))
@@ -137,7 +137,7 @@ def test_channels_last_differs_by_rounding_alone(name: str) -> None:
     plain = nano(name).double()
     net = place(copy.deepcopy(plain), CPU, settings(memory_format="channels_last"))
     rgb, thermal = (image.double() for image in images(2))
-    first, second = (each.train()(rgb, thermal, generator=generator()) for each in (plain, net))
+    first, second = (model.train()(rgb, thermal, generator=generator()) for model in (plain, net))
     torch.testing.assert_close(second.logits, first.logits, rtol=1e-9, atol=1e-11)
     assert any(
         parameter.is_contiguous(memory_format=torch.channels_last) and not parameter.is_contiguous()

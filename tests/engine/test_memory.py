@@ -83,8 +83,8 @@ def test_settings_with_less_memory() -> None:
     [
         ("mat1 and mat2 shapes cannot be multiplied", RuntimeError),
         *(
-            (each, InputError)
-            for each in (CUDA, "[alloc] can't allocate memory: 2", "X_ALLOC_FAILED")
+            (message, InputError)
+            for message in (CUDA, "[alloc] can't allocate memory: 2", "X_ALLOC_FAILED")
         ),
     ],
 )

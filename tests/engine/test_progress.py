@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import pytest
 
-from rgbt.engine.progress import Pace
+from rgbt.engine.progress import watch_pace
 
 
-def warned(pace: Pace, capsys: pytest.CaptureFixture[str], *steps: float) -> list[str]:
+def warned(
+    note: Callable[[float, float], None], capsys: pytest.CaptureFixture[str], *steps: float
+) -> list[str]:
     """The output after each of these steps, a quarter of which is waiting."""
     said = []
     for seconds in steps:
-        pace.add(seconds, seconds / 4)
+        note(seconds, seconds / 4)
         said.append(capsys.readouterr().err)
     return said
 
 
 def test_pace_ten_times_slower_warns_once(capsys: pytest.CaptureFixture[str]) -> None:
-    pace = Pace(threads=3)
-    assert warned(pace, capsys, *[0.1] * 150) == [""] * 150
+    note = watch_pace(3)
+    assert warned(note, capsys, *[0.1] * 150) == [""] * 150
     # The median of the last ten steps is that of the slow ones after six of them.
-    *before, sixth = warned(pace, capsys, *[1.2] * 6)
+    *before, sixth = warned(note, capsys, *[1.2] * 6)
     assert before == [""] * 5
     assert re.search(r"^rgbt: warning: a step takes 1\.2 s now, 12 times as long as before", sixth)
     assert "(25% of it waiting for images)" in sixth  # all ten steps waited for a quarter
     assert "trainer.threads=3" in sixth
-    assert warned(pace, capsys, *[9.9] * 50) == [""] * 50
+    assert warned(note, capsys, *[9.9] * 50) == [""] * 50
 
 
 @pytest.mark.parametrize(
@@ -40,12 +43,12 @@ def test_pace_ten_times_slower_warns_once(capsys: pytest.CaptureFixture[str]) ->
     ],
 )
 def test_pace_otherwise_is_silent(capsys: pytest.CaptureFixture[str], steps: list[float]) -> None:
-    assert not any(warned(Pace(threads=1), capsys, *steps))
+    assert not any(warned(watch_pace(1), capsys, *steps))
 
 
 def test_pace_compares_with_a_start_below_a_hundred_steps(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    *before, last = warned(Pace(threads=1), capsys, *[0.1] * 30, *[2.0] * 5)
+    *before, last = warned(watch_pace(1), capsys, *[0.1] * 30, *[2.0] * 5)
     assert not any(before)
     assert "1.05 s now, 10 times" in last

@@ -54,7 +54,7 @@ def test_shares_are_counted_as_they_are_written(every: float, steps: int) -> Non
     """In hundredths: 0.3 of 10 steps are 3, where floats say 3 - 4e-16 of three times 0.1."""
     schedule, hundredths = Steps(factor=0.5, every=every), round(100 * every)
     near = {n * hundredths * steps // 100 + off for n in range(12) for off in (-1, 0, 1)}
-    for step in sorted(each for each in near if 0 <= each < steps):
+    for step in sorted(number for number in near if 0 <= number < steps):
         assert schedule(step, steps, 1) == 0.5 ** (100 * step // (hundredths * steps))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.optimizers import SGD, Adam, AdamW
 from rgbt.engine.schedules import Poly, ThesisPoly
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.trainer import Trainer
+from rgbt.engine.trainer import Hooks, Trainer
 from rgbt.randomness import torch_generator
 from rgbt.requirements import NetworkRecord
 from rgbt.types import Batch, GeneratorOf, Phase
@@ -64,11 +64,17 @@ class Noisy:
         yield Phase(("main",), {"fit": loss, "extra": 0 * loss}, logged=logged)
 
 
-class Made:
-    """A scheme of one function."""
+class Recorded(Hooks):
+    """Keeps what is logged; the score of an evaluation is its step."""
 
-    def __init__(self, phases: Callable[[Batch, GeneratorOf], Iterator[Phase]]) -> None:
-        self.phases = phases
+    def __init__(self) -> None:
+        self.lines: list[tuple[int, dict[str, float]]] = []
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        self.lines.append((step, values))
+
+    def evaluate(self, step: int, network: nn.Module) -> float | None:
+        return float(step)
 
 
 def batches(start: int, batch_size: int = 4) -> Iterator[Batch]:
@@ -90,7 +96,7 @@ def batches(start: int, batch_size: int = 4) -> Iterator[Batch]:
 def halves() -> Iterator[Batch]:
     for batch in batches(0):
         for part in (slice(0, 2), slice(2, 4)):
-            tensors = {name: each[part] for name, each in vars(batch).items() if each is not None}
+            tensors = {key: value[part] for key, value in vars(batch).items() if value is not None}
             yield replace(batch, **tensors)
 
 
@@ -104,21 +110,20 @@ def make(folder: Path, poison: int | None = None, **changes: object) -> tuple[Tr
     torch.manual_seed(1)
     model = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 1))
     wrapped, optimizer = fabric.setup(model, AdamW(**ADAMW)(model))
-    log: list = []
+    hooks = Recorded()
     trainer = Trainer(
         fabric=fabric,
         settings=TrainerSettings(**{**SETTINGS, **changes}),
-        scheme=Noisy(wrapped, poison),
+        phases=Noisy(wrapped, poison).phases,
         model=wrapped,
         others={},
         optimizers={"main": optimizer},
         schedule=Poly(power=0.9, per="iteration", warmup_steps=0),
         steps_per_epoch=2,
         folder=folder,
-        record=lambda step, values: log.append((step, values)),
-        validate=float,
+        hooks=hooks,
     )
-    return trainer, log
+    return trainer, hooks.lines
 
 
 def sgd(model: nn.Module, **changes: Any) -> torch.optim.Optimizer:
@@ -140,7 +145,7 @@ def test_losses_and_values_beside_them_are_logged(tmp_path: Path) -> None:
 def test_every_step_is_timed_with_its_wait_for_images(tmp_path: Path) -> None:
     trainer, log = make(tmp_path)
     timed: list[tuple[float, float]] = []
-    trainer.pace.add = lambda *step: timed.append(step)  # type: ignore[method-assign, assignment]
+    trainer.note_pace = lambda *step: timed.append(step)  # type: ignore[assignment]
     trainer.fit(batches(0), State(seed=0))
     for (seconds, waited), (_, values) in zip(timed, log, strict=True):
         assert seconds == pytest.approx(4 / values["images_per_s"])
@@ -160,18 +165,18 @@ def test_weights_not_finite_are_neither_saved_nor_evaluated(
 ) -> None:
     trainer, _ = make(tmp_path)
     evaluated: list[int] = []
-    trainer.validate = lambda step: float(evaluated.append(step) or step)
+    trainer.hooks.evaluate = lambda step, _: float(evaluated.append(step) or step)
 
     def poison(step: int, values: dict[str, float]) -> None:
         if step == poisoned:
             trainer.model.get_submodule("2").bias.data[0] = float(value)
 
-    trainer.record = poison
+    trainer.hooks.log = poison
     with pytest.raises(RunError, match=rf"step {poisoned}: '2.bias' holds NaN or infinity"):
         trainer.fit(batches(0), State(seed=7))
     assert evaluated == []
     # Step 2 writes a checkpoint, step 3 would evaluate.
-    assert trainer.checkpoints.last.exists() == (poisoned == 3)
+    assert (tmp_path / "last.pt").exists() == (poisoned == 3)
 
 
 class Alternating:
@@ -197,7 +202,7 @@ def make_two(folder: Path, **changes: object) -> Trainer:
     torch.manual_seed(2)
     judge = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, 1))
     trainer.scheme = Alternating(trainer.model, judge)
-    trainer.others = trainer.scheme.others
+    trainer.phases, trainer.others = trainer.scheme.phases, trainer.scheme.others
     builder = Adam(lr=0.05, betas=(0.9, 0.99), weight_decay=0.0, eps=1e-8)
     trainer.optimizers["judge"] = builder(judge)
     trainer.log = log
@@ -240,9 +245,9 @@ def test_which_checkpoint_is_tested(
 ) -> None:
     """Without a selection split or a score, the last weights are the best."""
     trainer, _ = make(tmp_path, tested=tested)
-    trainer.validate = None if scores is None else scores.__getitem__
+    trainer.hooks.evaluate = lambda step, _: None if scores is None else scores[step]
     written: list[bool] = []
-    trainer.record = lambda *_: written.append(trainer.checkpoints.best.exists())
+    trainer.hooks.log = lambda *_: written.append((tmp_path / "best.pt").exists())
     state = State(seed=0)
     trainer.fit(batches(0), state)
     best = load_checkpoint(tmp_path / "best.pt")
@@ -271,7 +276,7 @@ def test_accumulated_phases_equal_those_of_the_whole_batch(
             yield Phase(("main",), {"one": model(seen).square().mean()})
             yield Phase(("second",), {"two": (model(seen) - 1).square().mean()}, clear=clear)
 
-        trainer.scheme = Made(phases)
+        trainer.phases = phases
         trainer.optimizers = {
             name: sgd(model, lr=0.05, momentum=0.9, weight_decay=0.01)
             for name in ("main", "second")
@@ -299,7 +304,7 @@ def test_what_is_not_cleared_is_added(tmp_path: Path, clear: bool) -> None:
         yield Phase(("main",), {"one": model(seen).square().mean()})  # w^2: 2 w = 4
         yield Phase(("second",), {"two": 3 * model(seen).mean()}, clear=clear)  # 3 w: 3
 
-    trainer.scheme = Made(phases)
+    trainer.phases = phases
     trainer.fit(iter([ones]), State(seed=0))
     assert model.weight.item() == pytest.approx(2 - 0.25 * 4 - 0.25 * (3 if clear else 7))
 
@@ -312,7 +317,7 @@ def test_line_has_the_last_values_of_alternating_steps(tmp_path: Path) -> None:
         loss = trainer.model(batch.rgb.mean((2, 3))).square().mean()
         yield Phase(("main",), {next(calls): loss})
 
-    trainer.scheme = Made(phases)
+    trainer.phases = phases
     trainer.fit(batches(0), State(seed=0))
     assert [step for step, _ in log] == [2, 4]
     assert all({"loss/even", "loss/odd"} <= set(values) for _, values in log)
@@ -327,7 +332,7 @@ def test_every_accumulated_batch_has_draws_of_its_own(tmp_path: Path) -> None:
         seen.append(torch.rand(4, generator=generator_of("noise")))
         yield Phase(("main",), {"fit": trainer.model(batch.rgb.mean((2, 3))).mean()})
 
-    trainer.scheme = Made(phases)
+    trainer.phases = phases
     trainer.fit(batches(0), State(seed=7))
     expected = [torch.rand(4, generator=torch_generator(7, "noise", n)) for n in range(6)]
     assert all(torch.equal(a, b) for a, b in zip(seen, expected, strict=True))
@@ -361,16 +366,16 @@ def test_gradients_are_clipped_once_per_phase(
     if phases[0][0] == ("all",):
         parts = {"all": [shared, one, other]}
     groups = {name: [{"params": part, "base_lr": 1.0}] for name, part in parts.items()}
-    trainer.optimizers = {name: torch.optim.SGD(each, lr=1.0) for name, each in groups.items()}
+    trainer.optimizers = {name: torch.optim.SGD(part, lr=1.0) for name, part in groups.items()}
 
     def scheme(batch: Batch, _: GeneratorOf) -> Iterator[Phase]:
         for names, gradients in phases:
             pairs = zip(gradients, (shared, one, other), strict=True)
-            yield Phase(names, {"fit": sum(factor * each for factor, each in pairs).sum()})
+            yield Phase(names, {"fit": sum(factor * value for factor, value in pairs).sum()})
 
-    trainer.scheme = Made(scheme)
+    trainer.phases = scheme
     trainer.fit(batches(0), State(seed=0))
-    assert [each.item() for each in trainer.model] == pytest.approx(list(ends), rel=1e-5)
+    assert [value.item() for value in trainer.model] == pytest.approx(list(ends), rel=1e-5)
     found = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
     assert found == {f"grad_norm{name}": pytest.approx(norm) for name, norm in norms.items()}
 
@@ -390,7 +395,7 @@ def test_rates_of_parts_follow_schedule_in_two_sessions(tmp_path: Path, head_rat
         trainer, log = make(tmp_path, max_steps=stop, checkpoint_every=1)
         optimizer = sgd(model, lr=0.1, backbone_multiplier=0.5, head_rate=head_rate)
         trainer = replace(trainer, model=model, optimizers={"main": optimizer})
-        trainer.scheme = Made(phases)
+        trainer.phases = phases
         trainer.schedule = lambda step, *_: ThesisPoly(power=0.9)(step, 5, 1)
         state = State(seed=0)
         trainer.resume(state)

@@ -195,6 +195,33 @@ def test_small_files_come_back(tmp_path: Path) -> None:
     assert [run.path for run in runs_in(tmp_path)] == [folder.path]
 
 
+def test_only_the_process_that_writes_changes_a_folder(tmp_path: Path) -> None:
+    written = RunFolder(tmp_path / "key")
+    regions = RegionTable("a", (0.5,), 0.5, 0.0)
+    classes = ClassTable(("car",), (0.5,), (0.5,), ((0.5,),), {})
+    nowhere = tmp_path / "none"
+    for folder in (
+        written,
+        RunFolder(written.path, writes=False),
+        RunFolder(nowhere, writes=False),
+    ):
+        before = {path.name: path.read_bytes() for path in written.path.iterdir()}
+        folder.mark({"names": str(len(before)), "files": "b"})
+        folder.write_config(f"a: {len(before)}")
+        folder.describe(Description(f"grbm {len(before)}", {}, {}))
+        folder.add_provenance({"command": "a", "diff": "--- x\n"})
+        folder.append(1, "train", {"loss": 0.5})
+        folder.append(2, "train", {"loss": 0.25})
+        lines = folder.truncate_after(1)
+        folder.write_tables(ResultTables("test", len(before), ("ring_1",), regions, classes))
+        folder.finish({"name": str(len(before))})
+        after = {path.name: path.read_bytes() for path in written.path.iterdir()}
+        assert (before == after) == (folder is not written)
+        assert len(lines) == {"key": 2 if folder is written else 1, "none": 0}[folder.path.name]
+    assert len(after) == 8
+    assert not nowhere.exists()
+
+
 def counts(dataset: str = "d", split: str = "test") -> Counts:
     matrix = np.ones((1, 1, 2, 2), np.int64)
     of = measurement(dataset=dataset, split=split, partition="ring1")

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from torch import nn
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
@@ -67,8 +68,9 @@ def test_the_step_in_progress_is_finished_and_saved(
     second.fit(batches(state.step), state)
     ends = [load_checkpoint(tmp_path / where / "last.pt") for where in ("whole", "run")]
     assert same(*ends)
-    names = [[sorted(values) for _, values in each] for each in (log, first_log + second_log)]
-    losses = [[(n, v["loss"]) for n, v in each] for each in (log, first_log + second_log)]
+    logs = (log, first_log + second_log)
+    names = [[sorted(values) for _, values in lines] for lines in logs]
+    losses = [[(step, values["loss"]) for step, values in lines] for lines in logs]
     assert names[0] == names[1]
     assert losses[0] == losses[1]
 
@@ -76,19 +78,19 @@ def test_the_step_in_progress_is_finished_and_saved(
 def test_evaluation_is_left_at_once_and_repeated_on_resuming(tmp_path: Path) -> None:
     waited: list[int] = []
 
-    def stopped(step: int) -> float:
+    def stopped(step: int, _: nn.Module) -> float:
         send(signal.SIGTERM)
         waited.append(step)
         return 0.0
 
     trainer, _ = train(tmp_path)
-    trainer.validate = stopped
+    trainer.hooks.evaluate = stopped
     with answered(), pytest.raises(Stopped) as stop:
         trainer.fit(batches(0), State(seed=7))
     assert (stop.value.step, waited) == (3, [])
     again, _ = train(tmp_path)
     evaluated: list[int] = []
-    again.validate = lambda step: evaluated.append(step) or float(step)  # type: ignore[func-returns-value]
+    again.hooks.evaluate = lambda step, _: evaluated.append(step) or float(step)
     state = State(seed=7)
     assert again.resume(state)
     assert (state.step, state.evaluated_step) == (3, 0)

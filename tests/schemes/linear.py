@@ -14,14 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.data.domains import Domain, Domains
-from rgbt.data.loaders import LoadedPair
 from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.trainer import Trainer
+from rgbt.engine.trainer import Hooks, Trainer
 from rgbt.models.inputs import expand_cells
 from rgbt.randomness import torch_generator
 from rgbt.requirements import MaskerRecord, SchemeRecord, record_of
-from rgbt.types import Batch, MaskPair, Output, View
+from rgbt.types import Batch, MaskPair, Output, TwoDomains, View
 from tests.losses.problems import batch_of
 
 K = 3
@@ -102,10 +101,10 @@ def images(purpose: str, number: int, confidence: bool = False) -> Batch:
     )
 
 
-def pairs(first: int = 0, confidence: bool = False) -> Iterator[LoadedPair]:
+def pairs(first: int = 0, confidence: bool = False) -> Iterator[TwoDomains]:
     for number in count(first):
         target = images("target", number, confidence=confidence)
-        yield LoadedPair(images("source", number), target, number)
+        yield TwoDomains(images("source", number), target, number)
 
 
 def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: Any) -> Trainer:
@@ -133,18 +132,19 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
         **changes,
     }
     log: list[dict[str, float]] = []
+    hooks = Hooks()
+    hooks.log = lambda step, values: log.append(values)  # type: ignore[method-assign]
     made = Trainer(
         fabric=fabric,
         settings=TrainerSettings(**settings),
-        scheme=scheme,
+        phases=scheme.phases,
         model=model,
         others=others,
         optimizers=built,
         schedule=lambda step, total, per_epoch: 1.0,
         steps_per_epoch=1,
         folder=folder,
-        record=lambda step, values: log.append(values),
-        validate=float,
+        hooks=hooks,
     )
     made.log = log  # type: ignore[attr-defined]
     return made

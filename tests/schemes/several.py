@@ -67,8 +67,8 @@ def own_part(data: Any) -> Any:
     """Of a batch, or of both domains: the samples of this process."""
     if isinstance(data, TwoDomains):
         return TwoDomains(own_part(data.source), own_part(data.target), data.step)
-    values = {each.name: getattr(data, each.name) for each in fields(data)}
-    parts = {name: own(each) for name, each in values.items() if isinstance(each, Tensor)}
+    values = {part.name: getattr(data, part.name) for part in fields(data)}
+    parts = {name: own(value) for name, value in values.items() if isinstance(value, Tensor)}
     return replace(data, **parts, name=tuple(own(torch.arange(len(data.name))).tolist()))
 
 
@@ -170,8 +170,8 @@ def self_training(*, heads: bool = False, **changes: Any) -> Case:
         return test_self_training.scheme_of(net, masker=INDEPENDENT, **more)
 
     case = two_domains(make, heads=heads, **settings, **changes)
-    for each in () if case.scheme.initial is None else case.scheme.initial.parameters():
-        each.data.mul_(0.5)  # as if the network had been trained since
+    for parameter in () if case.scheme.initial is None else case.scheme.initial.parameters():
+        parameter.data.mul_(0.5)  # as if the network had been trained since
     return case
 
 
@@ -212,15 +212,16 @@ CASES: dict[str, Callable[[], Case]] = {
 def mean_over_processes(values: Iterable[Tensor]) -> list[Tensor]:
     """The averages over the processes, in one transfer."""
     parts = list(values)
-    joined = total(torch.cat([each.detach().flatten() for each in parts])) / num_processes()
-    sizes = [each.numel() for each in parts]
+    joined = total(torch.cat([part.detach().flatten() for part in parts])) / num_processes()
+    sizes = [part.numel() for part in parts]
     return [new.view_as(old) for new, old in zip(joined.split(sizes), parts, strict=True)]
 
 
 def averaged_gradients(network: nn.Module) -> list[Tensor]:
     """Of every parameter; 0 where nothing depends on it."""
     return mean_over_processes(
-        torch.zeros_like(each) if each.grad is None else each.grad for each in network.parameters()
+        torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        for parameter in network.parameters()
     )
 
 

@@ -228,7 +228,7 @@ def test_parts_of_both_phases_by_their_formulas(heads: bool, changes: dict[str, 
         z = linear.scores(values, x, head)
         verdicts = shown(z, given["judged"]) @ judge["weight"].T + judge["bias"]
         cost, wrong = (
-            distance(verdicts, numbers[each], given["verdict_loss"]) for each in (name, other)
+            distance(verdicts, numbers[domain], given["verdict_loss"]) for domain in (name, other)
         )
         if name == "source" or given["supervise_target"]:
             expected[f"{name}/ce"] = linear.nats(z, y)
@@ -236,7 +236,7 @@ def test_parts_of_both_phases_by_their_formulas(heads: bool, changes: dict[str, 
             expected[f"{name}/adversarial"] = weight * wrong
         expected[f"critic/{name}"] = (0.5 if given["halved"] else 1.0) * cost
     steps = (0, 1) if given["alternates"] else (0,)
-    phases = [each for step in steps for each in phases_of(scheme, replace(pair, step=step))]
+    phases = [phase for step in steps for phase in phases_of(scheme, replace(pair, step=step))]
     found = {name: part for phase in phases for name, part in phase.parts.items()}
     assert found.keys() == expected.keys()
     for name, part in found.items():
@@ -250,8 +250,8 @@ def test_phases_of_step_do_not_share_trained_networks(heads: bool, changes: dict
     scheme = scheme_of(model, heads, **changes)
     both = (model, scheme.others["critic"])
     for phase in scheme.phases(pair_at(1, confidence=True), linear.generator_of):
-        for each in both:
-            each.zero_grad()
+        for module in both:
+            module.zero_grad()
         sum(phase.parts.values()).backward()
         touched = [any(p.grad is not None for p in module.parameters()) for module in both]
         assert touched == ([False, True] if phase.optimizers == ("critic",) else [True, False])
@@ -307,7 +307,7 @@ class Normalised(Linear):
 
 def changed(before: dict[str, Tensor], module: nn.Module) -> set[str]:
     now = module.state_dict()
-    return {name for name, each in before.items() if not torch.equal(each, now[name])}
+    return {name for name, value in before.items() if not torch.equal(value, now[name])}
 
 
 @pytest.mark.parametrize("heads", [False, True])
@@ -323,7 +323,7 @@ def test_alternating_steps_change_the_critic_and_then_the_network(
     statistics = {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
     state, batches = State(seed=0), pairs(confidence=True)
     for total in range(1, 5):
-        states = [{k: v.clone() for k, v in each.state_dict().items()} for each in both]
+        states = [{k: v.clone() for k, v in module.state_dict().items()} for module in both]
         made.settings = replace(made.settings, max_steps=total)
         made.fit(batches, state)
         of_model, of_critic = map(changed, states, both)
@@ -387,7 +387,7 @@ def test_idle_optimizers_decay_mean_squares_and_move_nothing(tmp_path: Path) -> 
         states = made.optimizers["main"].state
         found[idle_steps] = (
             linear.values_of(model),
-            [each["square_avg"] for each in states.values()],
+            [moments["square_avg"] for moments in states.values()],
         )
     (values, squares), (same, decayed) = found["none"], found["released"]
     assert all(torch.equal(values[name], same[name]) for name in values)

@@ -108,7 +108,7 @@ ALL = ("rgbt", "rgb", "thermal")
 def test_only_what_is_read_is_predicted(
     hides: bool, off: tuple[str, ...], call: tuple[object, ...], expected: dict[str, int]
 ) -> None:
-    crm = scheme(Halves() if hides else Nothing(), **{f"{each}_weight": 0.0 for each in off})
+    crm = scheme(Halves() if hides else Nothing(), **{f"{name}_weight": 0.0 for name in off})
     (phase,) = crm.phases(batch(), generator_of)
     names = ("passes", "views", "num_predictions", "num_masks")
     assert tuple(crm.model.call[name] for name in names) == call

@@ -53,7 +53,7 @@ def test_half_of_the_values_of_the_batch_are_pasted(values: list[int], pasted: i
         # Whole classes: both rows are the same.
         assert torch.equal(image[0], image[1])
         assert image[0].sum() == pasted
-    assert len(values) == 1 or not all(torch.equal(masks[0], each) for each in masks)
+    assert len(values) == 1 or not all(torch.equal(masks[0], mask) for mask in masks)
 
 
 def test_images_label_and_weight_are_pasted_with_one_mask() -> None:
@@ -63,7 +63,7 @@ def test_images_label_and_weight_are_pasted_with_one_mask() -> None:
     assert found.label.tolist() == [[[3, 5, 5], [5, 3, 5]]]
     assert found.confidence.tolist() == [[[1.0, 0.25, 0.25], [0.25, 1.0, 0.25]]]
     for name in ("rgb", "thermal"):
-        one, two, mix = (getattr(each, name) for each in (source, target, found))
+        one, two, mix = (getattr(batch, name) for batch in (source, target, found))
         assert torch.equal(mix[0, :, pasted[0]], one[0, :, pasted[0]])
         assert torch.equal(mix[0, :, ~pasted[0]], two[0, :, ~pasted[0]])
         assert not torch.equal(one, two)
@@ -319,8 +319,8 @@ def test_initial_network_sees_the_source_with_its_own_statistics() -> None:
     model.norm.running_mean.fill_(3.0)
     phase_of(scheme, batches())
     seen = [
-        (each.calls, each.norm.training, each.norm.running_mean.item())
-        for each in (scheme.teacher.network(), scheme.initial)
+        (net.calls, net.norm.training, net.norm.running_mean.item())
+        for net in (scheme.teacher.network(), scheme.initial)
     ]
     # The teacher has the statistics of its batch, the initial network those of the start.
     assert seen[0] == ([(("thermal",), None, False)], True, 3.0)
@@ -342,11 +342,11 @@ def test_labels_come_from_the_average_of_earlier_steps() -> None:
     """In step 1 the teacher is the mean of two networks, and the student another one."""
     model = network(False)
     scheme = scheme_of(model, masked_weight=0.0)
-    first = [each.detach().clone() for each in model.parameters()]
+    first = [parameter.detach().clone() for parameter in model.parameters()]
     phase_of(scheme, batches(0))
     with torch.no_grad():
-        for each in model.parameters():
-            each.add_(1.5 * torch.randn(each.shape, generator=generator_of("other")))
+        for parameter in model.parameters():
+            parameter.add_(1.5 * torch.randn(parameter.shape, generator=generator_of("other")))
     found = phase_of(scheme, batches(1)).logged[CONFIDENCE]
     average = network(False)
     for mean, one, two in zip(average.parameters(), first, model.parameters(), strict=True):
@@ -389,8 +389,8 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path: Path, changes: dict[str, 
     shutil.copytree(tmp_path / "stopped", tmp_path / "resumed")
     resumed = fit(tmp_path / "resumed", 6, State(seed=0))
     for one, other in ((straight.model, resumed.model), (straight.others, resumed.others)):
-        states = [each["teacher"] if isinstance(each, dict) else each for each in (one, other)]
-        values = [each.state_dict() for each in states]
+        states = [nets["teacher"] if isinstance(nets, dict) else nets for nets in (one, other)]
+        values = [net.state_dict() for net in states]
         assert values[0].keys() == values[1].keys()
         assert all(torch.equal(values[0][name], values[1][name]) for name in values[0])
     before, after = (made.others["teacher"].state_dict() for made in (stopped, straight))

@@ -66,7 +66,7 @@ class Recorded:
         compared = halved_mean(second.logits) if half else second.logits
         parts.append((warped - compared.softmax(1)).square().mean())
         queries = [frame.output.aux.get("class_logits") for frame in (first, second)]
-        parts += [each.square().mean() for each in queries if each is not None]
+        parts += [logits.square().mean() for logits in queries if logits is not None]
         return {str(number): part for number, part in enumerate(parts)}
 
 
@@ -103,8 +103,8 @@ def step(temporal: Temporal, given: Batch | None = None) -> Any:
 
 def gradients(module: nn.Module) -> list[Tensor]:
     found = [parameter.grad for parameter in module.parameters()]
-    assert all(each is not None and each.isfinite().all() for each in found)
-    return [each for each in found if each is not None]
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in found)
+    return [gradient for gradient in found if gradient is not None]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_outputs_gradients_and_statistics_are_those_of_two_calls(
     assert torch.equal(frames[1].rgb, view().batch(given, warp).rgb)
     assert torch.equal(frames[1].label, view().batch(given, warp).label)
     assert torch.equal(loss.valid, warp.inside())
-    outputs = [apart(each.rgb, each.thermal) for each in frames]
+    outputs = [apart(frame.rgb, frame.thermal) for frame in frames]
     first, second = (Frame(o, f, o.logits) for o, f in zip(outputs, frames, strict=True))
     warped = warp.bilinear(outputs[0].logits.softmax(1))
     parts = Recorded()(first, second, warped, loss.valid, None)
@@ -212,8 +212,8 @@ def test_half_resolution_warps_means_of_two_by_two_scores(warps: Any, hw: tuple[
     camera = Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=hw[0], width=hw[1])
     turned = view(mode="rotation", camera=camera)
     full, half = (
-        step(scheme(Net(nn.Identity()), view=turned, warps=warps, resolution=each), batch(hw=hw))
-        for each in ("full", "half")
+        step(scheme(Net(nn.Identity()), view=turned, warps=warps, resolution=size), batch(hw=hw))
+        for size in ("full", "half")
     )
     scores = halved_mean(full.first.logits)
     warp = turned.warp(turned.draw(B, generator_of("virtual view")), hw).halved()

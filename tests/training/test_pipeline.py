@@ -18,7 +18,7 @@ from rgbt.config.compose import compose
 from rgbt.files.atomic import holding
 from rgbt.run import main
 from rgbt.runs.folder import RunFolder
-from rgbt.runs.naming import TAGS
+from rgbt.runs.naming import TAGS, describe
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify
 from rgbt.tracking.tracker import Tracking
@@ -42,35 +42,29 @@ class Notes:
     invalid: tuple[str, ...] = ()
     finished_by_another: bool = False
 
-    def training(
+    def validate(self, spec: RunSpec) -> None:
+        assert not self.trained
+        self.validated.append(spec.name)
+        if spec.name in self.invalid:
+            raise InputError("does not fit.")
+
+    def predict_labels(self, spec: RunSpec) -> None:
+        for teacher, _, _ in spec.missing_labels:
+            assert teacher.run.is_finished
+            self.labels.append((teacher.run.name, spec.name))
+
+    def train_run(
         self, spec: RunSpec, extra_tags: Mapping[str, str] | None = None, upstream_of: str = ""
-    ) -> Any:
-        notes = self
-
-        class Noted:
-            def validate(self) -> None:
-                assert not notes.trained
-                notes.validated.append(spec.name)
-                if spec.name in notes.invalid:
-                    raise InputError("does not fit.")
-
-            def predict_labels(self) -> None:
-                for teacher, _, _ in spec.missing_labels:
-                    assert teacher.run.is_finished
-                    notes.labels.append((teacher.run.name, spec.name))
-
-            def complete(self) -> None:
-                if extra_tags is not None:  # the requested run
-                    assert (extra_tags, upstream_of) == ({"row": "1"}, "")
-                    return
-                if notes.refused:
-                    raise notes.refused.pop(0)
-                finish(spec)
-                if notes.finished_by_another:
-                    raise InputError("is being trained by process 1; wait for it.")
-                notes.trained.append(spec.name)
-
-        return Noted()
+    ) -> None:
+        if extra_tags is not None:  # the requested run
+            assert (extra_tags, upstream_of) == ({"row": "1"}, "")
+            return
+        if self.refused:
+            raise self.refused.pop(0)
+        finish(spec)
+        if self.finished_by_another:
+            raise InputError("is being trained by process 1; wait for it.")
+        self.trained.append(spec.name)
 
 
 Pipeline = Callable[..., Notes]
@@ -92,7 +86,8 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Pipeline:
 
     def run(experiment: str, *overrides: str, notes: Notes | None = None) -> Notes:
         notes = notes or Notes()
-        monkeypatch.setattr(pipeline, "Training", notes.training)
+        for name in ("validate", "predict_labels", "train_run"):
+            monkeypatch.setattr(pipeline, name, getattr(notes, name))
         spec = spec_of(experiment, f"runs_dir={tmp_path}", *overrides)
         pipeline.run_pipeline(spec, {"row": "1"})
         return notes
@@ -178,7 +173,7 @@ def test_pipeline_predicts_and_validates_for_unfinished_labels(
 
     monkeypatch.setattr(train, "with_weights", opened)
     with pytest.raises(KeyError, match=teacher.key):
-        Training(spec).predict_labels()
+        train.predict_labels(spec)
     folder.mkdir()
     assert run("multi_head_night_stage1").validated == []
 
@@ -247,11 +242,10 @@ def test_run_stopped_while_its_tracking_begins_is_closed(
         def finish(self, status: str) -> None:
             self.ended = status
 
-    training = Training(spec_of("mfnet", f"runs_dir={tmp_path}"))
-    training.folder, training.tracking = RunFolder(tmp_path), (tracking := Slow())
+    spec, tracking = spec_of("mfnet", f"runs_dir={tmp_path}"), Slow()
     dataset = SimpleNamespace(fingerprint=lambda: "abc")
-    training.setup = SimpleNamespace(session=SimpleNamespace(dataset=dataset))  # type: ignore[assignment]
+    setup: Any = SimpleNamespace(session=SimpleNamespace(spec=spec, dataset=dataset))
     monkeypatch.setattr(Training, "_claim", lambda *_: None)
     with pytest.raises(KeyboardInterrupt):
-        training._fill_folder()
+        Training(setup, describe(spec), RunFolder(tmp_path), tracking).run()
     assert tracking.ended == "KILLED"
