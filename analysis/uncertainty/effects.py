@@ -35,14 +35,14 @@ class Effect:
     corrected: float
 
     def is_shown(self, level: float = 0.95) -> bool:
-        """Whether the effect differs from 0, corrected for the number of effects."""
+        """Say whether the effect differs from 0, corrected for the number of effects."""
         return self.corrected < 1 - level
 
 
 def estimate_effects(
     cells: Sequence[Evidence], contrasts: Values, noise: Noise, level: float = 0.95
 ) -> list[Effect]:
-    """Effects with intervals over seeds and images.
+    """Estimate effects with intervals over seeds and images.
 
     Args:
         cells: evidence of an outcome in C cells, with the same seeds and draws of images.
@@ -64,7 +64,7 @@ def estimate_effects(
     seeds = len(values)
     # Each seed is a block: initial weights and the order of the data are the same in all its cells.
     left = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
-    found = []
+    found: list[Estimate] = []
     for signs in contrasts:
         is_mean = bool((signs > 0).all())
         weights = signs / count if is_mean else 2.0 * signs / count
@@ -74,5 +74,5 @@ def estimate_effects(
             variance = float((left**2).sum()) / freedom * float((weights**2).sum()) / seeds
             evidence = replace(evidence, trainings=Spread(math.sqrt(variance), freedom))
         found.append(estimate_of(evidence, level))
-    ps = holm([math.nan if each.both is None else each.p for each in found])
-    return [Effect(each, p) for each, p in zip(found, ps, strict=True)]
+    ps = holm([math.nan if estimate.both is None else estimate.p for estimate in found])
+    return [Effect(estimate, p) for estimate, p in zip(found, ps, strict=True)]

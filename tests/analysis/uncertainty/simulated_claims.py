@@ -88,7 +88,7 @@ def any_wrong(tables: int, claims: int, ratio: float, rule: Rule) -> float:
 
     def wrong() -> bool:
         drawn = [draw(rng, 0.0, ratio) for _ in range(claims)]
-        return any(until_decided(*each, rule)[0] == "holds" for each in drawn)
+        return any(until_decided(*claim, rule)[0] == "holds" for claim in drawn)
 
     return float(np.mean([wrong() for _ in range(tables)]))
 

@@ -310,8 +310,8 @@ def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
     naive = stats.t.ppf(0.975, np.arange(1, 200)) / np.sqrt(np.arange(2, 201))
     drawn = [running(rng, 200) for _ in range(1500)]
     missed, fixed = (
-        np.mean([(np.abs(means) > sds * each).any() for means, sds in drawn])
-        for each in (factors, naive)
+        np.mean([(np.abs(means) > sds * factor).any() for means, sds in drawn])
+        for factor in (factors, naive)
     )
     assert 0.01 < missed < 0.05
     assert fixed > 0.3
