@@ -86,16 +86,16 @@ def main(options: CompareOptions, _: list[str]) -> int:
     if options.condition and options.frames:
         raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
     stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
-    sides = open_counts(options.a, *stored), open_counts(options.b, *stored)
-    paths_a, paths_b = ({found.path for found in side} for side in sides)
-    shared = paths_a & paths_b
+    side_a = open_counts(options.a, *stored)
+    side_b = open_counts(options.b, *stored)
+    shared = {found.path for found in side_a} & {found.path for found in side_b}
     if shared:
         raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
-    a, b = ([found.counts for found in side] for side in sides)
+    a, b = [found.counts for found in side_a], [found.counts for found in side_b]
     settings = options.settings(None if options.absent == "as counted" else options.absent)
     comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
     shown = f" ({options.condition})" if options.condition else ""
-    labels = [f"{label}{shown}" for label in _labels(sides)]
+    labels = [f"{label}{shown}" for label in _labels(side_a, side_b)]
     grid = comparison_grid(comparison, labels, absent_classes([*a, *b], settings.absent))
     said = sentence(comparison, *labels)
     print_rich(rich_table(grid))
@@ -106,7 +106,7 @@ def main(options: CompareOptions, _: list[str]) -> int:
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
         "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
-    lines = [said, unlike, *_remarks(comparison, sides, labels), remark]
+    lines = [said, unlike, *_remarks(comparison, (side_a, side_b), labels), remark]
     print_rich(plain_text("\n".join(filter(None, lines))))
     text = "\n".join(filter(None, [grid.to_markdown(), said, unlike, ""]))
     files = {"comparison.md": text, "comparison.csv": comparison_frame(comparison)}
@@ -126,8 +126,8 @@ def _remarks(
     remarks = [f"{part}: {said}." for part, said in parts.items()]
     lists = []
     for side in sides:
-        names = {found.run.lists for found in side if found.run}
-        lists.append(" or ".join(sorted(names)))
+        of_side = {found.run.lists for found in side if found.run}
+        lists.append(" or ".join(sorted(of_side)))
     if lists[0] != lists[1] and all(lists):
         remarks.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
     return [*remarks, comparison.evidence.reason]
@@ -204,7 +204,8 @@ def comparison_frame(comparison: Comparison) -> pd.DataFrame:
         images, both = found.difference.images or none, found.difference.both or none
         scores = found.a.value, found.b.value, found.a.seeds, found.b.seeds, found.value
         bounds = images.low, images.high, both.low, both.high
-        rows.append((found.metric, *scores, *bounds, found.difference.p, found.p_corrected))
+        ps = found.difference.p, found.p_corrected
+        rows.append((found.metric, *scores, *bounds, *ps))
     columns = ["metric", "a", "b", "seeds_a", "seeds_b", "difference"]
     columns += ["images_low", "images_high", "both_low", "both_high", "p", "p_holm"]
     return pd.DataFrame(rows, columns=columns)
@@ -220,7 +221,7 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return (absent_rule(used), *notes)
 
 
-def _labels(sides: Sequence[Sequence[Evaluation]]) -> list[str]:
+def _labels(*sides: Sequence[Evaluation]) -> list[str]:
     """Return labels that differ: the methods, with their seeds where these have one name."""
     plain = labels = [label_of(side) for side in sides]
     if plain[0] == plain[1]:

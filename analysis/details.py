@@ -91,13 +91,14 @@ def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]
         kind = (None, *KINDS).index(details and details.kind)
         return regions_of(key[1]), kind, ("", *VIEWS).index(key[0])
 
-    keys = sorted({key for found in by_training for key in found}, key=order)
+    known: set[Key] = set()
+    for found in by_training:
+        known.update(found)
+    keys = sorted(known, key=order)
     views = {view for view, _ in keys}
     is_more = len(views) > 1 or any(details_of(partition) for _, partition in keys)
     for training, found in zip(opened, by_training, strict=True):
-        missing = [
-            details_of(partition) for view, partition in keys if (view, partition) not in found
-        ]
+        missing = [details_of(key[1]) for key in keys if key not in found]
         if missing or not (is_more or training.run is None):
             modality = "..." if is_more and len(views) == 1 else "modality=all"
             lacking = [details.kind for details in missing if details is not None]

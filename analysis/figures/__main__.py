@@ -58,10 +58,12 @@ def main(options: Any, overrides: list[str]) -> int:
         return 0
     check_choice("figure", name, FIGURES)
     spec = FIGURES[name]
-    groups = {word: word.lstrip("+~").partition("=")[0].split(".")[0] for word in overrides}
     known = [option.name for option in fields(spec.options)]
     idle = [key for key in given if key not in known]
-    idle += [group for group in groups.values() if group not in spec.groups]
+    for word in overrides:
+        group = word.lstrip("+~").partition("=")[0].split(".")[0]
+        if group not in spec.groups:
+            idle.append(group)
     if idle:
         near = nearest(idle[0], ["figure", "out", *known, *spec.groups])
         raise InputError(f"'{idle[0]}' has no effect on figure={name}; {near}.")

@@ -226,7 +226,9 @@ class FramePair(NamedTuple):
     def shares(self) -> tuple[float, ...]:
         """Percent of the compared pixels that differ, for each method; NaN where none is."""
         count = int(self.compared.sum())
-        return tuple(100 * int(mask.sum()) / count if count else math.nan for mask in self.differ)
+        if count == 0:
+            return (math.nan,) * len(self.differ)
+        return tuple(100 * int(mask.sum()) / count for mask in self.differ)
 
 
 def read_pairs(

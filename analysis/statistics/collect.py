@@ -207,14 +207,15 @@ def _resized(sample: Sample, short_edge: int) -> Sample:
         return sample
     factor = short_edge / min(height, width)
     size = round(width * factor), round(height * factor)
-    rgb, thermal = (
-        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        for image in (sample.rgb, sample.thermal)
-    )
+    rgb, thermal = _by_area(sample.rgb, size), _by_area(sample.thermal, size)
     label = sample.label
     if label is not None:
         label = np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return replace(sample, rgb=rgb, thermal=thermal, label=label)
+
+
+def _by_area(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _check(sample: Sample, like: Sample) -> None:
