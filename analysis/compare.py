@@ -178,7 +178,7 @@ def comparison_grid(
         row.append(ends_of(found.difference.images))
         if with_seeds:
             row.append(ends_of(found.difference.both))
-        rows.append((*row, _p_text(found.difference.p), _p_text(found.p_corrected)))
+        rows.append((*row, _p_text(found.difference.p), _p_text(found.difference.p_corrected)))
     level = f"{100 * comparison.level:g} % over images"
     over = [level, f"{level} and seeds"] if with_seeds else [level]
     drawn = f"{comparison.images} single images"
@@ -204,7 +204,7 @@ def comparison_frame(comparison: Comparison) -> pd.DataFrame:
         images, both = found.difference.images or none, found.difference.both or none
         scores = found.a.value, found.b.value, found.a.seeds, found.b.seeds, found.value
         bounds = images.low, images.high, both.low, both.high
-        ps = found.difference.p, found.p_corrected
+        ps = found.difference.p, found.difference.p_corrected
         rows.append((found.metric, *scores, *bounds, *ps))
     columns = ["metric", "a", "b", "seeds_a", "seeds_b", "difference"]
     columns += ["images_low", "images_high", "both_low", "both_high", "p", "p_holm"]

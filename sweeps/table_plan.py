@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.uncertainty.contrasts import FIXED
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
+from analysis.uncertainty.verdicts import Rule
 from rgbt.checks import InputError, check_choice, split_list
 from rgbt.config.command import composing
 from rgbt.config.component import Component
@@ -218,7 +218,7 @@ def plan_table(
             "or add claims to the table."
         )
     sizes = {} if options.dry_run else network_sizes(request)
-    judge = TableJudge(name, request.table, AnyTime() if adds else FixedSeeds(), sizes=sizes)
+    judge = TableJudge(name, request.table, Rule(any_time=adds), sizes=sizes)
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
     title, points = f"{name} scale={request.scale}", tuple(request.points())

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from analysis.statistics.collect import ALL, MODALITIES
 from analysis.statistics.measure import ESTIMATORS
 from analysis.statistics.resampled import AVERAGES, ResampledSplit, Values, entropies, normalised
-from analysis.uncertainty.verdicts import FixedSeeds, decide
+from analysis.uncertainty.verdicts import Rule, decide
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -91,7 +91,7 @@ def judged(sample: ResampledSplit) -> pd.DataFrame:
 def _decided(sample: ResampledSplit, stated: dict[str, Any]) -> Iterator[tuple[object, ...]]:
     """Yield the numbers of a statement, with its verdict and their own intervals and verdicts."""
     assert sample.settings is not None, "a verdict needs resamples"
-    wanted, rule = RANGES[stated["wanted"]], FixedSeeds(level=sample.settings.level)
+    wanted, rule = RANGES[stated["wanted"]], Rule(level=sample.settings.level)
     found = [*_stated_numbers(sample, stated)]
     evidences = [sample.evidence(number.values, number.part, number.present) for number in found]
     if not found:

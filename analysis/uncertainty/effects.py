@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -27,21 +27,9 @@ from analysis.uncertainty.intervals import Spread, holm
 Noise = Literal["cells", "effects"]
 
 
-@dataclass(frozen=True)
-class Effect:
-    """One effect: its estimate, and its p-value corrected for its family (Holm)."""
-
-    estimate: Estimate
-    corrected: float
-
-    def is_shown(self, level: float = 0.95) -> bool:
-        """Say whether the effect differs from 0, corrected for the number of effects."""
-        return self.corrected < 1 - level
-
-
 def estimate_effects(
     cells: Sequence[Evidence], contrasts: Values, noise: Noise, level: float = 0.95
-) -> list[Effect]:
+) -> list[Estimate]:
     """Estimate effects with intervals over seeds and images.
 
     Args:
@@ -52,7 +40,7 @@ def estimate_effects(
         level: of the intervals.
 
     Returns:
-        E effects, whose p-values are corrected for E.
+        E estimates, whose p-values are corrected for E (Holm).
 
     Raises:
         ValueError: contrasts of another number of cells, or unbalanced ones.
@@ -75,4 +63,4 @@ def estimate_effects(
             evidence = replace(evidence, trainings=Spread(math.sqrt(variance), freedom))
         found.append(estimate_of(evidence, level))
     ps = holm([math.nan if estimate.both is None else estimate.p for estimate in found])
-    return [Effect(estimate, p) for estimate, p in zip(found, ps, strict=True)]
+    return [replace(estimate, p_corrected=p) for estimate, p in zip(found, ps, strict=True)]

@@ -38,6 +38,8 @@ class Estimate:
         trainings: interval over seeds, images as they are; None for one seed.
         both: interval over images and seeds; None where one of the two is.
         p: two-sided p-value of `interval` against 0; NaN without one.
+        p_corrected: the same, corrected for the number of estimates that are shown together (Holm);
+            NaN where it was not corrected.
     """
 
     value: float
@@ -48,11 +50,16 @@ class Estimate:
     both: Interval | None
     p: float
     evidence: Evidence
+    p_corrected: float = math.nan
 
     @property
     def interval(self) -> Interval | None:
         """The interval to go by: over images and seeds, else over images."""
         return self.both or self.images
+
+    def is_shown(self, level: float = 0.95) -> bool:
+        """Say whether it differs from 0, corrected for the number of estimates."""
+        return self.p_corrected < 1 - level
 
 
 def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
@@ -118,15 +125,13 @@ class Difference:
     """Method b less method a in one score.
 
     Attributes:
-        difference: the estimate of ``b - a``.
-        p_corrected: its p-value, corrected for the number of scores compared (Holm).
+        difference: the estimate of ``b - a``, corrected for the number of scores compared.
     """
 
     metric: str
     a: Estimate
     b: Estimate
     difference: Estimate
-    p_corrected: float = math.nan
 
     @property
     def value(self) -> float:
@@ -190,7 +195,8 @@ def compare(
         raise InputError(f"{said} are too few to compare two methods; {FEWEST} are the least.")
     ps = holm([compared.difference.p for compared in found])
     for index, p in enumerate(ps):
-        found[index] = replace(found[index], p_corrected=p)
+        estimated = replace(found[index].difference, p_corrected=p)
+        found[index] = replace(found[index], difference=estimated)
     return Comparison(
         differences=tuple(found),
         images=len(images_of(parse(metrics[0]), a[0]).names),
@@ -241,7 +247,7 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
         more = f"{abs(found.value):.2f}{unit} {'higher' if found.value > 0 else 'lower'}"
         said = f"{start}the {metric} of {label_b} is {more} than that of {label_a} {evidence}"
         count = len(comparison.differences)
-        corrected = f"corrected for all {count} scores compared, {_as_p(found.p_corrected)}"
+        corrected = f"corrected for all {count} scores compared, {_as_p(difference.p_corrected)}"
         end = f"; {corrected}" if count > 1 else ""
     else:
         said = f"{start}a difference in {metric} between {label_b} and {label_a} is not shown"

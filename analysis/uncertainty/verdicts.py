@@ -38,7 +38,7 @@ Covers = Literal["images and seeds", "images", "none"]
 # Largest number of seeds that is searched for `Verdict.seeds_needed`.
 MOST_SEEDS = 1000
 
-# Warning of a verdict on one common start; rates of `FixedSeeds` in simulations.
+# Warning of a verdict on one common start; rates of fixed seeds in simulations.
 ONE_START = (
     "All seeds began from one start, and the interval does not contain the spread between starts. "
     "If a start shifts a difference by two standard deviations of the seeds, 18 % of claims about "
@@ -87,43 +87,37 @@ def half_width(sd: float, count: int, alpha: float, precision: float = PRECISION
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixedSeeds:
-    """Rule for a number of seeds that was chosen before any result was known.
+class Rule:
+    """How the seeds were chosen, which decides how wide an interval is.
 
-    The interval of `level` is that of `analysis.uncertainty.compare` for paired trainings: Student
-    over images and seeds, never narrower than over seeds alone. Few seeds cannot show whether they
-    are normal: with 3 to 10 lognormal ones (sd 1 of the logarithm), 14 to 18 % of the verdicts
-    about no difference are wrong instead of 5 %.
+    Attributes:
+        any_time: False: the number of seeds was chosen before any result was known. The interval is
+            that of `analysis.uncertainty.compare` for paired trainings: Student over images and
+            seeds, never narrower than over seeds alone. Few seeds cannot show whether they are
+            normal: with 3 to 10 lognormal ones (sd 1 of the logarithm), 14 to 18 % of the verdicts
+            about no difference are wrong instead of 5 %.
+            True: seeds are added until the verdict is clear. Seeds: a confidence sequence, see
+            `half_width`. Images: Student's interval. Each has half of the error rate, and the
+            squares of their half widths add up. At a `level` of 95 % for all intervals together,
+            at most 4.8 % of simulated sequences ever missed the truth (2 to 3,000 seeds). With the
+            whole error rate for each it was up to 9.8 %.
+        level: confidence level of all intervals together.
     """
 
+    any_time: bool = False
     level: float = 0.95
 
     def half(self, trainings: Spread, images: Spread, level: float) -> float:
-        """Return half of the width of the interval; degrees of freedom of `trainings`: n - 1."""
-        return student(0.0, images_and_seeds(images, trainings, level), level).half
+        """Return half of the width of an interval; degrees of freedom of `trainings`: n - 1.
 
-
-@dataclass(frozen=True, kw_only=True)
-class AnyTime:
-    """Rule for seeds that are added until the verdict is clear.
-
-    Seeds: a confidence sequence, see `half_width`. Images: Student's interval.
-    Each has half of the error rate, and the squares of their half widths add up. At a `level` of
-    95 % for all intervals together, at most 4.8 % of simulated sequences ever missed the truth (2
-    to 3,000 seeds). With the whole error rate for each it was up to 9.8 %.
-    """
-
-    level: float = 0.95
-
-    def half(self, trainings: Spread, images: Spread, level: float) -> float:
-        """Return half of the width; infinite where seeds are too few for a confidence sequence."""
+        Infinite where seeds are too few for a confidence sequence.
+        """
+        if not self.any_time:
+            return student(0.0, images_and_seeds(images, trainings, level), level).half
         alpha = (1 - level) / 2
         count = round(trainings.freedom) + 1
         of_seeds = half_width(trainings.error * math.sqrt(count), count, alpha)
         return math.hypot(of_seeds, student(0.0, images, 1 - alpha).half)
-
-
-Rule = FixedSeeds | AnyTime
 
 
 @dataclass(frozen=True, kw_only=True)

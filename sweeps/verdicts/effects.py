@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from analysis.uncertainty.contrasts import Evidence, Term, combine
-from analysis.uncertainty.effects import Effect, Noise, estimate_effects
+from analysis.uncertainty.effects import Noise, estimate_effects
+from analysis.uncertainty.estimates import Estimate
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT
 from sweeps.point import Outcome
@@ -131,14 +132,13 @@ def _lines(
     for family in filter(None, (firsts[:mains], firsts[mains:])):
         signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
         found += estimate_effects(cells, signs, NOISE[part])
-    for name, each in zip((MEAN, *groups), found, strict=True):
-        estimate, evidence = each.estimate, each.estimate.evidence
-        around = estimate.both
+    for name, estimate in zip((MEAN, *groups), found, strict=True):
+        evidence, around = estimate.evidence, estimate.both
         ends = (math.nan,) * 3 if around is None else (around.low, around.high, estimate.p)
         yield {
             "effect": name,
-            **dict(zip(NUMBERS, (estimate.value, *ends, each.corrected), strict=True)),
-            "shown": ABSENT if name == MEAN and not against else _word(each),
+            **dict(zip(NUMBERS, (estimate.value, *ends, estimate.p_corrected), strict=True)),
+            "shown": ABSENT if name == MEAN and not against else _word(estimate),
             "error_seeds": evidence.trainings.error if evidence.trainings else math.nan,
             "error_images": evidence.error,
             "seeds": estimate.seeds,
@@ -146,10 +146,9 @@ def _lines(
         }
 
 
-def _word(effect: Effect) -> str:
-    estimate = effect.estimate
+def _word(estimate: Estimate) -> str:
     if estimate.both is None:
         return "2 seeds needed" if estimate.seeds < 2 else "too few images"
-    if not effect.is_shown():
+    if not estimate.is_shown():
         return "no"
     return "higher" if estimate.value > 0 else "lower"

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, Verdict, decide
+from analysis.uncertainty.verdicts import Rule, Verdict, decide
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
@@ -245,7 +245,7 @@ class TableJudge:
 
     name: str
     table: Table
-    rule: Rule = field(default_factory=FixedSeeds)
+    rule: Rule = field(default_factory=Rule)
     resamples: int = RESAMPLES
     sizes: Mapping[CellId, TableCell] = field(default_factory=dict)
     stored: StoredRuns = field(default_factory=StoredRuns)
@@ -442,7 +442,7 @@ def rule_of(results: Iterable[RunResult]) -> Rule:
     The tag of any table counts, because tables share runs.
     """
     is_added = any(name.startswith(UNTIL_DECIDED) for run in results for name in run.tags)
-    return AnyTime() if is_added else FixedSeeds()
+    return Rule(any_time=is_added)
 
 
 def _exact_verdict(value: float, *, is_so: bool) -> Verdict:

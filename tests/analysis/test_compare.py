@@ -73,7 +73,7 @@ def test_table_sentence_and_files_hold_the_compared_numbers(
             "images_low": line.interval.low,
             "images_high": line.interval.high,
             "p": line.difference.p,
-            "p_holm": line.p_corrected,
+            "p_holm": line.difference.p_corrected,
             "seeds_a": 1,
             "seeds_b": 1,
         }

@@ -110,7 +110,7 @@ def ever_missed(sequences: int, longest: int, ratio: float) -> dict[str, float]:
     """Share of sequences in which one interval after 2 to `longest` seeds misses the truth.
 
     Ways to join the halves over seeds and images at a level of 95 %: squares with the whole error
-    rate for each, squares with half of it for each (`AnyTime`), sums with half of it for each.
+    rate for each, squares with half of it for each (as `Rule` does), sums with half of it for each.
     """
     rng = np.random.default_rng([9, round(100 * ratio)])
     whole, split = halves(longest, 0.05), halves(longest, 0.025)

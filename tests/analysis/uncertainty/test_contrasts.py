@@ -13,7 +13,7 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.blocks import ImageBlocks
 from analysis.uncertainty.contrasts import FIXED, Resampler, Term
 from analysis.uncertainty.estimates import estimate_of
-from analysis.uncertainty.verdicts import FixedSeeds, decide
+from analysis.uncertainty.verdicts import Rule, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -99,7 +99,7 @@ def test_evidence_gives_the_interval_of_paired_comparisons(blocks) -> None:
     found = Resampler(settings).evidence(difference(rows, "Var"))
     wanted = estimate_of(found, settings.level)
     assert ("neighbouring frames" in found.said) == (blocks != "none")
-    verdict = decide([found], (0.0, math.inf), FixedSeeds(), "all")
+    verdict = decide([found], (0.0, math.inf), Rule(), "all")
     assert verdict.interval is not None
     assert (verdict.interval.low, verdict.interval.high, verdict.estimate) == pytest.approx(
         (wanted.interval.low, wanted.interval.high, wanted.value)

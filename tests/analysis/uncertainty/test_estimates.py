@@ -134,8 +134,10 @@ def test_nothing_to_score_is_nan() -> None:
     metrics = ["class/cone", "class/car", "class/car"]
     nothing, some = compare(*sides, metrics, settings).differences
     assert nothing.interval is None
-    assert all(map(math.isnan, (nothing.value, nothing.difference.p, nothing.p_corrected)))
-    assert some.p_corrected == some.difference.p
+    assert all(
+        map(math.isnan, (nothing.value, nothing.difference.p, nothing.difference.p_corrected))
+    )
+    assert some.difference.p_corrected == some.difference.p
 
 
 def test_night_is_scored_on_its_own_images() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.uncertainty.verdicts import AnyTime
+from analysis.uncertainty.verdicts import Rule
 from sweeps.point import Outcome, Point
 from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest, seed_of
@@ -43,7 +43,7 @@ def adding(*claims: Claim, max_seeds: int = MAX) -> SeedsUntilDecided:
         "own/t", table(rows, claims=claims), "demo", tuple(range(START)), until_decided=True
     )
     quick = 200
-    judge = TableJudge("own/t", request.table, AnyTime(), quick)
+    judge = TableJudge("own/t", request.table, Rule(any_time=True), quick)
     return SeedsUntilDecided(request, judge, max_seeds)
 
 
