@@ -57,7 +57,7 @@ class DrawOptions:
     seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the resampling")] = 0
 
     def settings(self, absent: Absent | None = None) -> Resampling:
-        """See `Resampling`, of which these are; InputError: a level out of range."""
+        """Return the settings of the resampling; InputError: a level out of range."""
         from analysis.uncertainty import Resampling
 
         return Resampling(
@@ -76,7 +76,7 @@ def check_out(out: Path | None) -> None:
 
 
 def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
-    """The data set that overrides choose; InputError: none is chosen, or wrong settings."""
+    """Build the data set that overrides choose; InputError: none is chosen, or wrong settings."""
     # Without this the images of another data set would be scored against the embedded one.
     if not any(word.startswith("dataset=") for word in overrides):
         raise InputError(
@@ -89,37 +89,38 @@ def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar on stderr; yields a function to call after each of `total` steps."""
+    """Show a bar on stderr; yields a function to call after each of `total` steps."""
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
 
 
-def in_threads(work: Callable[..., T], *items: Iterable[Any], threads: int) -> Iterator[T]:
-    """``map(work, *items)`` by threads (0: one per core), for work outside of Python's lock.
+def in_threads(work: Callable[..., T], *arguments: Iterable[Any]) -> Iterator[T]:
+    """Yield ``map(work, *arguments)`` by a thread per core, for work outside of Python's lock.
 
-    The first error cancels items that have not started.
+    The first error cancels calls that have not started.
     """
-    with ThreadPoolExecutor(threads or usable_cores()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         try:
-            yield from pool.map(work, *items)
+            yield from pool.map(work, *arguments)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def text_table(title: str, frame: pd.DataFrame, notes: Sequence[str] = ()) -> TextTable:
-    """A frame as text: its index as labels, then its columns; numbers with two decimals."""
-    header = (*(str(name or "") for name in frame.index.names), *map(str, frame.columns))
-    rows = (tuple(map(_cell, row)) for row in frame.reset_index().itertuples(index=False))
-    return TextTable(title, header, tuple(rows), tuple(notes))
+    """Show a frame as text: its index as labels, then its columns; numbers with two decimals."""
+    labels = [str(name or "") for name in frame.index.names]
+    rows = [tuple(map(_cell, row)) for row in frame.reset_index().itertuples(index=False)]
+    return TextTable(title, (*labels, *map(str, frame.columns)), tuple(rows), tuple(notes))
 
 
 def tidy_csv(frame: pd.DataFrame) -> str:
-    """A frame without its index as CSV, eight digits; nothing where a value is missing."""
-    cells = frame.astype(object).where(frame.notna(), "")
-    rows = ([f"{c:.8g}" if isinstance(c, float) else c for c in row] for row in cells.to_numpy())
-    return csv_text([[*frame.columns], *rows])
+    """Write a frame without its index as CSV, eight digits; nothing where a value is missing."""
+    rows = [[*frame.columns]]
+    for row in frame.astype(object).where(frame.notna(), "").to_numpy():
+        rows.append([f"{cell:.8g}" if isinstance(cell, float) else cell for cell in row])
+    return csv_text(rows)
 
 
 def write_files(out: Path | None, files: Mapping[str, str | pd.DataFrame]) -> None:

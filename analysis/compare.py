@@ -5,6 +5,7 @@ One table and one sentence: the differences with intervals and p-values, over im
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +36,7 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(DrawOptions):
+class CompareOptions(DrawOptions):
     """Options of ``rgbt compare``."""
 
     a: Annotated[
@@ -79,43 +80,61 @@ class Options(DrawOptions):
     out: Annotated[Path | None, Help("output folder of comparison.md and comparison.csv")] = None
 
 
-def main(options: Options, _: list[str]) -> int:
+def main(options: CompareOptions, _: list[str]) -> int:
     """Compare two methods on the same images."""
     check_out(options.out)
     if options.condition and options.frames:
         raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
     stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
-    opened = [open_counts(side, *stored) for side in (options.a, options.b)]
-    if shared := {each.path for each in opened[0]} & {each.path for each in opened[1]}:
+    side_a = open_counts(options.a, *stored)
+    side_b = open_counts(options.b, *stored)
+    shared = {found.path for found in side_a} & {found.path for found in side_b}
+    if shared:
         raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
-    a, b = ([each.counts for each in side] for side in opened)
+    a, b = [found.counts for found in side_a], [found.counts for found in side_b]
     settings = options.settings(None if options.absent == "as counted" else options.absent)
-    found = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
+    comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
     shown = f" ({options.condition})" if options.condition else ""
-    labels = [f"{label}{shown}" for label in _labels(opened)]
-    grid = comparison_grid(found, labels, absent_classes([*a, *b], settings.absent))
-    said = sentence(found, *labels)
+    labels = [f"{label}{shown}" for label in _labels(side_a, side_b)]
+    grid = comparison_grid(comparison, labels, absent_classes([*a, *b], settings.absent))
+    said = sentence(comparison, *labels)
     print_rich(rich_table(grid))
-    # Scores by day and by night are over other images.
-    drawn = {parse(each.metric).part: each.a.evidence.said for each in found.differences}
-    parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
-    lists = [" or ".join(sorted({e.run.lists for e in each if e.run})) for each in opened]
-    if lists[0] != lists[1] and all(lists):
-        parts.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
-    unlike = f"Measured differently ({'; '.join(found.unlike)})." if found.unlike else ""
+    unlike = ""
+    if comparison.unlike:
+        unlike = f"Measured differently ({'; '.join(comparison.unlike)})."
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
         "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
-    lines = [said, unlike, *parts, found.evidence.reason, remark]
+    lines = [said, unlike, *_remarks(comparison, (side_a, side_b), labels), remark]
     print_rich(plain_text("\n".join(filter(None, lines))))
     text = "\n".join(filter(None, [grid.to_markdown(), said, unlike, ""]))
-    write_files(options.out, {"comparison.md": text, "comparison.csv": comparison_frame(found)})
+    files = {"comparison.md": text, "comparison.csv": comparison_frame(comparison)}
+    write_files(options.out, files)
     return 0
 
 
+def _remarks(
+    comparison: Comparison, sides: Sequence[Sequence[Evaluation]], labels: Sequence[str]
+) -> list[str]:
+    """Say which images days and nights are, which lists differ, and why images were so drawn."""
+    parts = {}
+    for difference in comparison.differences:
+        part = parse(difference.metric).part
+        if part is not None:  # scores by day and by night are over other images
+            parts[part] = difference.a.evidence.said
+    remarks = [f"{part}: {said}." for part, said in parts.items()]
+    lists = []
+    for side in sides:
+        of_side = {found.run.lists for found in side if found.run}
+        lists.append(" or ".join(sorted(of_side)))
+    if lists[0] != lists[1] and all(lists):
+        remarks.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
+    return [*remarks, comparison.evidence.reason]
+
+
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The requested metrics; "auto": the usual scores of the counts.
+    """Return the requested metrics; "auto": the usual scores of the counts.
 
     Means also by day and by night, where all counts have enough images of both for `settings`.
     """
@@ -125,67 +144,75 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
     if details_of(partition) is not None:
         return list(score_grid.headlines(every[0]))
     protocol = protocol_of(partition)
-    means = [names.MIOU] if protocol is None else [*HEADLINES[protocol]]
-    numbers = range(1, every[0].counts.shape[1] + 1)
-    regions = [names.VAR, *map(names.region, numbers)] if protocol is None else []
+    if protocol is None:
+        means = [names.MIOU]
+        regions = [names.region(number) for number in range(1, every[0].counts.shape[1] + 1)]
+        metrics = [*means, names.VAR, *regions]
+    else:
+        means = [*HEADLINES[protocol]]
+        metrics = [*means]
     # Neighbours of two sequences make no common block: a few images more than the product.
     fewest = FEWEST * (settings.blocks + 1 if isinstance(settings.blocks, int) else 1)
-    told = [counts.parts() for counts in every]
-    parts = [
-        names.subset(part, metric)
-        for part in (names.DAY, names.NIGHT)
-        if all(part in each and len(each[part].names) >= fewest for each in told)
-        for metric in means
-    ]
-    return [*means, *regions, *parts]
+    for part in (names.DAY, names.NIGHT):
+        of_part = [counts.parts().get(part) for counts in every]
+        if all(counts is not None and len(counts.names) >= fewest for counts in of_part):
+            metrics += [names.subset(part, metric) for metric in means]
+    return metrics
 
 
 def comparison_grid(
-    found: Comparison, labels: Sequence[str], notes: tuple[str, ...] = ()
+    comparison: Comparison, labels: Sequence[str], notes: tuple[str, ...] = ()
 ) -> TextTable:
-    """One line per score."""
+    """Show one line per score."""
 
-    def between(interval: Interval | None) -> str:
+    def ends_of(interval: Interval | None) -> str:
         return f"{interval.low:+.2f} to {interval.high:+.2f}" if interval else ABSENT
 
-    def of_p(p: float) -> str:
-        return ABSENT if p != p else "<0.001" if p < 0.001 else f"{p:.3f}"
-
-    with_seeds = any(each.difference.both is not None for each in found.differences)
+    with_seeds = any(found.difference.both is not None for found in comparison.differences)
     rows = []
-    for each in found.differences:
-        spreads = ["" if side.sd != side.sd else f" ± {side.sd:.2f}" for side in (each.a, each.b)]
-        scores = [number(each.a.value) + spreads[0], number(each.b.value) + spreads[1]]
-        scores.append(ABSENT if each.value != each.value else f"{each.value:+.2f}")
-        ends = [between(each.difference.images), between(each.difference.both)][: 1 + with_seeds]
-        rows.append((each.metric, *scores, *ends, of_p(each.difference.p), of_p(each.p_corrected)))
-    level = f"{100 * found.level:g} % over images"
-    over = [level, f"{level} and seeds"][: 1 + with_seeds]
-    singles = f"{found.images} single images"
-    said = found.evidence.said
-    drawn = singles if said == singles else f"{found.images} images, {said}"
-    title = f"{labels[1]} minus {labels[0]}: {drawn}, {found.partition}"
+    for found in comparison.differences:
+        row = [found.metric]
+        for side in (found.a, found.b):
+            row.append(number(side.value) + ("" if math.isnan(side.sd) else f" ± {side.sd:.2f}"))
+        row.append(ABSENT if math.isnan(found.value) else f"{found.value:+.2f}")
+        row.append(ends_of(found.difference.images))
+        if with_seeds:
+            row.append(ends_of(found.difference.both))
+        rows.append((*row, _p_text(found.difference.p), _p_text(found.difference.p_corrected)))
+    level = f"{100 * comparison.level:g} % over images"
+    over = [level, f"{level} and seeds"] if with_seeds else [level]
+    drawn = f"{comparison.images} single images"
+    if comparison.evidence.said != drawn:
+        drawn = f"{comparison.images} images, {comparison.evidence.said}"
+    title = f"{labels[1]} minus {labels[0]}: {drawn}, {comparison.partition}"
     return TextTable(title, ("", *labels, "difference", *over, "p", "p (Holm)"), tuple(rows), notes)
 
 
-def comparison_frame(found: Comparison) -> pd.DataFrame:
-    """One row per score; NaN where there is no interval."""
+def _p_text(p: float) -> str:
+    if math.isnan(p):
+        return ABSENT
+    return "<0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def comparison_frame(comparison: Comparison) -> pd.DataFrame:
+    """Make one row per score; NaN where there is no interval."""
     import pandas as pd
 
-    none = Interval(float("nan"), float("nan"))
+    none = Interval(math.nan, math.nan)
     rows = []
-    for each in found.differences:
-        intervals = (each.difference.images or none, each.difference.both or none)
-        bounds = [end for interval in intervals for end in (interval.low, interval.high)]
-        scores = each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value
-        rows.append((each.metric, *scores, *bounds, each.difference.p, each.p_corrected))
+    for found in comparison.differences:
+        images, both = found.difference.images or none, found.difference.both or none
+        scores = found.a.value, found.b.value, found.a.seeds, found.b.seeds, found.value
+        bounds = images.low, images.high, both.low, both.high
+        ps = found.difference.p, found.difference.p_corrected
+        rows.append((found.metric, *scores, *bounds, *ps))
     columns = ["metric", "a", "b", "seeds_a", "seeds_b", "difference"]
     columns += ["images_low", "images_high", "both_low", "both_high", "p", "p_holm"]
     return pd.DataFrame(rows, columns=columns)
 
 
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
-    """How absent classes count, by `absent` or as counted, and which both methods lack."""
+    """Say how absent classes count, by `absent` or as counted, and which both methods lack."""
     first, used = every[0], absent or convention(every)
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
         return (absent_rule(used),)  # their matrices have no labels as rows
@@ -194,16 +221,18 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return (absent_rule(used), *notes)
 
 
-def _labels(opened: Sequence[tuple[Evaluation, ...]]) -> list[str]:
-    """Labels that differ: the names of the methods, with their seeds where these are equal."""
-    plain = labels = [label_of(each) for each in opened]
+def _labels(*sides: Sequence[Evaluation]) -> list[str]:
+    """Return labels that differ: the methods, with their seeds where these have one name."""
+    plain = labels = [label_of(side) for side in sides]
     if plain[0] == plain[1]:
-        seeds = [sorted(named.seed for named in each if named.seed is not None) for each in opened]
-        labels = [f"{plain[0]} seed {', '.join(map(str, each))}" for each in seeds if each]
+        labels = []
+        for side in sides:
+            seeds = sorted(found.seed for found in side if found.seed is not None)
+            labels += [f"{plain[0]} seed {', '.join(map(str, seeds))}"] if seeds else []
     return labels if len(set(labels)) == 2 else [f"a: {plain[0]}", f"b: {plain[1]}"]
 
 
-entry = PlainCommand(Options, main, heeds=())
+entry = PlainCommand(CompareOptions, main, heeds=())
 
 if __name__ == "__main__":
     entry()

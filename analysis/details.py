@@ -38,7 +38,7 @@ Scores = tuple[ScoreGrid, Mapping[str, Estimate]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(DrawOptions):
+class DetailsOptions(DrawOptions):
     """Options of ``rgbt details``."""
 
     run: Annotated[
@@ -54,7 +54,7 @@ class Options(DrawOptions):
     out: Annotated[Path | None, Help("output folder of details.md and details.csv")] = None
 
 
-def main(options: Options, _: list[str]) -> int:
+def main(options: DetailsOptions, _: list[str]) -> int:
     """Show every stored score of a method by region, class, bin and input."""
     check_out(options.out)
     settings = options.settings()
@@ -63,95 +63,108 @@ def main(options: Options, _: list[str]) -> int:
     for key, counts in _stored(opened, options.split).items():
         grid = score_grid(counts[0])
         found[key] = grid, estimate(counts, list(dict.fromkeys(grid.metrics)), settings)
-    grids = list(_grids(found, label_of(opened)))
-    for each in grids:
-        print_rich(rich_table(each))
-    evidence = next(iter(next(iter(found.values()))[1].values())).evidence
+    tables = list(_tables(found, label_of(opened)))
+    for table in tables:
+        print_rich(rich_table(table))
+    first = next(iter(found.values()))[1]
+    evidence = next(iter(first.values())).evidence
     seeds = " and seeds" if len(opened) > 1 else ""
     remark = (
         f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({evidence.said}), "
         f"{settings.resamples} resamples. {evidence.reason} {absent_rule(opened[0].counts.absent)}"
     )
     print_rich(remark)
-    text = "\n".join([*(each.to_markdown() for each in grids), remark, ""])
+    text = "\n".join([*(table.to_markdown() for table in tables), remark, ""])
     write_files(options.out, {"details.md": text, "details.csv": _frame(found)})
     return 0
 
 
 def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]:
-    """The counts of a method by what they are of, one for each training."""
-    every: list[dict[Key, Counts]] = []
-    for named in opened:
-        found: dict[Key, Counts] = {}
-        for each in evaluations_of(named.run, split) if named.run else [named]:
-            of = each.counts.measurement
-            is_alike = set(of.changed) <= {"view", "partition"} and not protocol_of(of.partition)
-            if named.run is None or is_alike:
-                found[of.view if named.run else "", of.partition] = each.counts
-        every.append(found)
+    """Return the counts of a method by what they are of, one for each training.
+
+    InputError: a training lacks counts that another has, or has none beside those of its end.
+    """
+    by_training = [_by_key(training, split) for training in opened]
 
     def order(key: Key) -> tuple[str, int, int]:
         details = details_of(key[1])
         kind = (None, *KINDS).index(details and details.kind)
         return regions_of(key[1]), kind, ("", *VIEWS).index(key[0])
 
-    keys = sorted({key for found in every for key in found}, key=order)
-    is_more = len({view for view, _ in keys}) > 1 or any(details_of(key[1]) for key in keys)
-    for named, found in zip(opened, every, strict=True):
+    known: set[Key] = set()
+    for found in by_training:
+        known.update(found)
+    keys = sorted(known, key=order)
+    views = {view for view, _ in keys}
+    is_more = len(views) > 1 or any(details_of(partition) for _, partition in keys)
+    for training, found in zip(opened, by_training, strict=True):
         missing = [details_of(key[1]) for key in keys if key not in found]
-        if missing or not (is_more or named.run is None):
-            is_one = is_more and len({view for view, _ in keys}) == 1
-            views = "..." if is_one else "modality=all"
-            kinds = ",".join(dict.fromkeys(each.kind for each in missing if each)) or "boundary"
-            folder = named.path.parent
+        if missing or not (is_more or training.run is None):
+            modality = "..." if is_more and len(views) == 1 else "modality=all"
+            lacking = [details.kind for details in missing if details is not None]
+            kinds = ",".join(dict.fromkeys(lacking)) or "boundary"
+            folder = training.path.parent
             raise InputError(
                 f"{folder} has no counts of {kinds} of split '{split}'; write them with rgbt "
-                f"evaluate run={folder} {views} details={kinds}"
+                f"evaluate run={folder} {modality} details={kinds}"
             )
-    return {key: [found[key] for found in every] for key in keys}
+    return {key: [found[key] for found in by_training] for key in keys}
 
 
-def _grids(found: Mapping[Key, Scores], label: str) -> Iterator[TextTable]:
-    """The scores as text; tables of one line are joined, with a line for each input."""
+def _by_key(training: Evaluation, split: str) -> dict[Key, Counts]:
+    """Return the counts of the same images that a run has; a file alone has no named input."""
+    if training.run is None:
+        return {("", training.counts.partition): training.counts}
+    found = {}
+    for stored in evaluations_of(training.run, split):
+        of = stored.counts.measurement
+        if set(of.changed) <= {"view", "partition"} and not protocol_of(of.partition):
+            found[of.view, of.partition] = stored.counts
+    return found
+
+
+def _tables(found: Mapping[Key, Scores], label: str) -> Iterator[TextTable]:
+    """Yield the scores as text; tables of one line are joined, with a line for each input."""
     groups: dict[tuple[str, str, str], list[Key]] = {}
     for (view, partition), (grid, _) in found.items():
         alone = view if len(grid.rows) > 1 else ""
         groups.setdefault((alone, grid.title, regions_of(partition)), []).append((view, partition))
     for (alone, title, regions), keys in groups.items():
-        grid = found[keys[0]][0]
-        named = ", ".join(filter(None, (label, alone)))
-        is_joined = len(grid.rows) == 1 and keys[0][0] != ""
-        rows = [
-            (key[0] if is_joined else name, *_cells(found[key][1], metrics))
-            for key in keys
-            for name, metrics in found[key][0].rows
-        ]
+        first, _ = found[keys[0]]
+        is_joined = len(first.rows) == 1 and keys[0][0] != ""
+        rows = []
+        for view, partition in keys:
+            grid, estimates = found[view, partition]
+            for name, metrics in grid.rows:
+                cells = [_cell(estimates[metric]) for metric in metrics]
+                rows.append((view if is_joined else name, *cells))
+        named = f"{label}, {alone}" if alone else label
         title = f"{named}: {title}{' and input' if is_joined else ''} ({regions})"
-        yield TextTable(title, ("", *grid.columns), tuple(rows))
+        yield TextTable(title, ("", *first.columns), tuple(rows))
 
 
-def _cells(estimates: Mapping[str, Estimate], metrics: Sequence[str]) -> Iterator[str]:
-    for each in (estimates[metric] for metric in metrics):
-        ends = each.interval
-        yield number(each.value) + (f" [{ends.low:.2f}, {ends.high:.2f}]" if ends else "")
+def _cell(score: Estimate) -> str:
+    ends = score.interval
+    return number(score.value) + (f" [{ends.low:.2f}, {ends.high:.2f}]" if ends else "")
 
 
 def _frame(found: Mapping[Key, Scores]) -> pd.DataFrame:
-    """One row per score; NaN where there is no interval."""
+    """Make one row per score; NaN where there is no interval."""
     import pandas as pd
 
     rows = []
     for (view, partition), (_, estimates) in found.items():
         details = details_of(partition)
         about = regions_of(partition), details.kind if details else "", view
-        for metric, each in estimates.items():
-            ends = (each.interval.low, each.interval.high) if each.interval else (None, None)
-            rows.append((*about, metric, each.value, each.sd, each.seeds, *ends))
+        for metric, score in estimates.items():
+            interval = score.interval
+            ends = (interval.low, interval.high) if interval else (None, None)
+            rows.append((*about, metric, score.value, score.sd, score.seeds, *ends))
     columns = ["regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high"]
     return pd.DataFrame(rows, columns=columns)
 
 
-entry = PlainCommand(Options, main, heeds=())
+entry = PlainCommand(DetailsOptions, main, heeds=())
 
 if __name__ == "__main__":
     entry()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
@@ -36,10 +37,13 @@ if TYPE_CHECKING:
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"  # tags of runs
 ALL = "all"  # subset of all images of a split
 
+# Columns of `score_frame`, columns that say which counts they are of, and columns of `results`.
 SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
 OF_FILES = ("run", "experiment", "group", "seed", "split", "condition", "severity", "partition")
 COLUMNS = (*OF_FILES, *SCORE_COLUMNS)
-# Columns of `score_frame`, of what they are, and of `results`.
+
+# One score in a frame: the values of `SCORE_COLUMNS`.
+ScoreRow = tuple[str, int, str, str, float]
 
 # Words of messages for what a list may contain.
 RUNS = "runs, files of counts or a group"
@@ -102,14 +106,14 @@ class Evaluation:
 
 
 def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
-    """All finished runs of a folder of runs and of an archive, by key.
+    """Return the finished runs of a folder of runs and of an archive, by key.
 
     A missing folder or archive is empty. A damaged run is left out with a warning. Of a key with
     other counts in both, the run of the folder is taken, and a warning names the key. Archived runs
     are unpacked once, into the cache of the user.
     """
     root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
-    folders = [each.path for each in runs_in(root)] if root.is_dir() else []
+    folders = [stored.path for stored in runs_in(root)] if root.is_dir() else []
     paths = [*filter(is_finished, folders), *archived(Path(archive))]
     what, console = f"reading runs of {root} and {archive}", Console(stderr=True)
     is_hidden = not console.is_terminal
@@ -119,11 +123,8 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
             run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read
             first = found.setdefault(run.key, run)
-            if first is run:
-                continue
-            for name in counts_of(run.folder) & counts_of(first.folder):
-                one, two = (Counts.load(each.folder / name) for each in (first, run))
-                differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
+            if first is not run and _has_other_counts(run, first):
+                differing.add(run.key)
         except InputError as error:
             warn(f"{path} is left out: {error}")
     for key in sorted(differing):
@@ -131,13 +132,27 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     return [found[key] for key in sorted(found)]
 
 
+def _has_other_counts(run: RunResult, first: RunResult) -> bool:
+    """Compare the files of counts that both runs have."""
+    for name in counts_of(run.folder) & counts_of(first.folder):
+        counts, of_first = Counts.load(run.folder / name), Counts.load(first.folder / name)
+        if not np.array_equal(counts.counts, of_first.counts):
+            return True
+    return False
+
+
 def counts_of(folder: Path) -> set[Path]:
-    """The files of counts of a run, inside its folder."""
-    return {path.relative_to(folder) for each in COUNTS for path in folder.glob(each)}
+    """List the files of counts of a run, relative to its folder."""
+    paths: list[Path] = []
+    for pattern in COUNTS:
+        paths += folder.glob(pattern)
+    return {path.relative_to(folder) for path in paths}
 
 
 def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
-    """Counts of a run of one split: as it ended, then other inputs, pairs of frames, corruptions.
+    """Yield the counts of a run on one split: as it ended, then everything else it was measured on.
+
+    That is other inputs, pairs of frames, details and corruptions.
 
     A damaged file is left out with a warning.
     """
@@ -152,39 +167,46 @@ def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
-    """Every score of counts of single frames, of pairs of frames, or of details, one a row.
+    """Compute every score of counts of single frames, of pairs of frames, or of details.
 
     `absent`: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
 
     Returns:
-        the columns `SCORE_COLUMNS`: subset ("all", "day", "night"), region (0: the whole image),
-        class ("": all scored classes), metric and value in percent; Var in squared points, NaN:
-        nothing to score.
+        a row for each score, with the columns `SCORE_COLUMNS`: subset ("all", "day", "night"),
+        region (0: the whole image), class ("": all scored classes), metric and value in percent;
+        Var in squared points, NaN: nothing to score.
     """
     import pandas as pd
 
     absent = absent or counts.absent
-    rows: list[tuple[str, int, str, str, float]] = []
-    if not _is_plain(counts):
+    rows: list[ScoreRow] = []
+    if _is_plain(counts):
+        for subset, part in {ALL: counts, **counts.parts()}.items():
+            rows += _part_rows(subset, part, absent, counts.scored)
+    else:
         for name in dict.fromkeys(score_grid(counts).metrics):
             of = parse(name)
             score = "/".join(filter(None, (of.score, of.bin)))
             place = of.part or ALL, of.region or 0, of.class_name or "", score
             rows.append((*place, value(name, counts, absent)))
-        return pd.DataFrame(rows, columns=SCORE_COLUMNS)
-    for subset, part in {ALL: counts, **counts.parts()}.items():
-        by_region = part.by_region()
-        matrices = np.concatenate([by_region.sum(0, keepdims=True), by_region])
-        for metric, mean in MEANS.items():
-            values = 100 * mean(matrices, absent, counts.scored)
-            rows += [(subset, region, "", metric, float(v)) for region, v in enumerate(values)]
-        of_regions = miou(by_region, absent, counts.scored)
-        rows.append((subset, 0, "", names.VAR, float(variance(of_regions))))
-        for metric, by_class in (("IoU", iou), ("acc", recall)):
-            for region, values in enumerate(100 * by_class(matrices, absent)):
-                pairs = zip(counts.classes, values.tolist(), strict=True)
-                rows += [(subset, region, name, metric, each) for name, each in pairs]
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+
+
+def _part_rows(
+    subset: str, counts: Counts, absent: Absent, scored: NDArray[np.bool_]
+) -> Iterator[ScoreRow]:
+    """Yield the scores of single frames of one subset; region 0 is the whole image."""
+    by_region = counts.by_region()
+    matrices = np.concatenate([by_region.sum(0, keepdims=True), by_region])
+    for metric, mean in MEANS.items():
+        for region, score in enumerate(100 * mean(matrices, absent, scored)):
+            yield subset, region, "", metric, float(score)
+    of_regions = miou(by_region, absent, scored)
+    yield subset, 0, "", names.VAR, float(variance(of_regions))
+    for metric, by_class in (("IoU", iou), ("acc", recall)):
+        for region, scores in enumerate(100 * by_class(matrices, absent)):
+            for name, score in zip(counts.classes, scores.tolist(), strict=True):
+                yield subset, region, name, metric, score
 
 
 def results(
@@ -195,7 +217,7 @@ def results(
     absent: Absent | None = None,
     evaluations: bool = True,
 ) -> pd.DataFrame:
-    """Scores of all finished runs (`finished_runs`) as one frame: one score a row.
+    """Compute the scores of all finished runs (`finished_runs`) as one frame: one score a row.
 
     `absent` is that of `score_frame`. Without `evaluations`, only the counts that a run ended with
     are read, and none of other inputs, corruptions, details and pairs of frames.
@@ -209,13 +231,22 @@ def results(
 
     frames = []
     for run in finished_runs(runs, archive):
-        texts = run.key, run.tags.get(EXPERIMENT, ""), run.tags.get(GROUP, "")
-        for each in evaluations_of(run, split):
-            if not evaluations and each.path.parent != run.folder:
+        for found in evaluations_of(run, split):
+            if not evaluations and found.path.parent != run.folder:
                 continue
-            found = (*texts, each.seed, split, each.condition, each.severity, each.counts.partition)
-            of_file = dict(zip(OF_FILES, found, strict=True))
-            frames.append(score_frame(each.counts, absent).assign(**of_file))
+            frame = score_frame(found.counts, absent)
+            frames.append(
+                frame.assign(
+                    run=run.key,
+                    experiment=run.tags.get(EXPERIMENT, ""),
+                    group=run.tags.get(GROUP, ""),
+                    seed=found.seed,
+                    split=split,
+                    condition=found.condition,
+                    severity=found.severity,
+                    partition=found.counts.partition,
+                )
+            )
     if not frames:
         return pd.DataFrame(columns=COLUMNS)
     return pd.concat(frames, ignore_index=True)[[*COLUMNS]].astype({"seed": "Int64"})
@@ -229,7 +260,7 @@ def open_counts(
     condition: str = "",
     archive: Path | str = "results",
 ) -> tuple[Evaluation, ...]:
-    """The counts that `text` names, the seeds of one method one after the other.
+    """Open the counts that `text` names, the seeds of one method one after the other.
 
     Args:
         text: a run (folder, config key or MLflow run id), a file of counts (.npz), the name of a
@@ -253,13 +284,15 @@ def open_counts(
             else:
                 path = source.resolve()
                 found.append(Evaluation(path, Counts.load(path)))
-    for path, counts in ((each.path, each.counts) for each in found):
+    for evaluation in found:
+        path, counts = evaluation.path, evaluation.counts
         if split and counts.split != split:
             raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
         if frames and protocol_of(counts.partition) != frames:
             raise InputError(f"{path} is by {counts.partition}, not frames={frames}.")
     _check_trainings_differ(text, found)
-    if len(labels := dict.fromkeys(each.label for each in found)) > 1:
+    labels = _labels(found)
+    if len(labels) > 1:
         info(f"{' and '.join(labels)}, listed together, are treated as seeds of one method.")
     return tuple(found)
 
@@ -281,13 +314,17 @@ def _check_trainings_differ(text: str, found: Sequence[Evaluation]) -> None:
             )
 
 
-def label_of(counts: Sequence[Evaluation]) -> str:
-    """Name of a method: its group, or the names of all its counts."""
-    return " + ".join(dict.fromkeys(each.label for each in counts))
+def label_of(evaluations: Sequence[Evaluation]) -> str:
+    """Return the name of a method: its group, or the names of all its counts."""
+    return " + ".join(_labels(evaluations))
+
+
+def _labels(evaluations: Sequence[Evaluation]) -> list[str]:
+    return list(dict.fromkeys(evaluation.label for evaluation in evaluations))
 
 
 def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult | Path]:
-    """The runs, or the file of counts, that a word names."""
+    """Find the runs, or the file of counts, that a word names."""
     path = Path(word).expanduser()
     if path.suffix == ".npz":
         return [path]
@@ -295,14 +332,16 @@ def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult
         return [RunResult(find_run(word, runs_dir))]
     except (InputError, OSError):  # OSError: longer than a file's name may be
         finished = finished_runs(runs_dir, archive)
-    if chosen := [run for run in finished if word in (run.key, run.tags.get(GROUP))]:
+    chosen = [run for run in finished if word in (run.key, run.tags.get(GROUP))]
+    if chosen:
         return chosen
     # A folder that `analysis.score` wrote has counts by rings, as the papers' tables are, and more.
     files = []
     with suppress(OSError):
         files = sorted(path.glob("counts_ring*.npz")) or sorted(path.glob("counts_*.npz"))
     if len(files) > 1:
-        raise InputError(f"{path} has {', '.join(f.name for f in files)}; name one of these.")
+        listed = ", ".join(file.name for file in files)
+        raise InputError(f"{path} has {listed}; name one of these.")
     groups = {run.tags.get(GROUP, "") for run in finished} - {""}
     known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
     known = known if finished else f"; neither {runs_dir} nor {archive} has a finished run"
@@ -320,84 +359,91 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
     if not (frames or condition):
         return Evaluation(run.folder / counts_name(split), run.counts(split), run)
     known = list(evaluations_of(run, split))
-    name, *severity = condition.split(" ", 1)
-    wanted = " ".join((row_name(name), *severity))
-    chosen = [each for each in known if condition and wanted in (each.condition, each.said)]
     if frames:
-        known = [each for each in known if protocol_of(each.counts.partition) == frames]
-        chosen = [each for each in known if each.condition == each.counts.partition]
+        known = [found for found in known if protocol_of(found.counts.partition) == frames]
+        chosen = [found for found in known if found.condition == found.counts.partition]
         # Other views than the published ones are marked, as all next frames.
-        chosen = [each for each in chosen if "-" not in each.counts.partition] or chosen
-    if len(chosen) != 1:
-        said = ", ".join(each.said for each in known) or "none"
-        what = f"condition={condition}" if condition else f"frames={frames}"
-        if chosen:
-            files = ", ".join(each.path.name for each in chosen)
-            raise InputError(f"{what} names {files} in {run.folder}; name one of these files.")
-        raise InputError(
-            f"{what} is not counted in {run.folder}, which has {said} of split '{split}'; rgbt "
-            "consistency, robustness and evaluate make counts."
-        )
-    return chosen[0]
+        chosen = [found for found in chosen if "-" not in found.counts.partition] or chosen
+    else:
+        name, *severity = condition.split(" ", 1)
+        wanted = " ".join((row_name(name), *severity))
+        chosen = [found for found in known if wanted in (found.condition, found.said)]
+    if len(chosen) == 1:
+        return chosen[0]
+    what = f"condition={condition}" if condition else f"frames={frames}"
+    if chosen:
+        files = ", ".join(found.path.name for found in chosen)
+        raise InputError(f"{what} names {files} in {run.folder}; name one of these files.")
+    counted = ", ".join(found.said for found in known) or "none"
+    raise InputError(
+        f"{what} is not counted in {run.folder}, which has {counted} of split '{split}'; rgbt "
+        "consistency, robustness and evaluate make counts."
+    )
 
 
 def _is_plain(counts: Counts) -> bool:
-    """Whether they are of single frames, without details."""
+    """Say whether counts are of single frames, without details."""
     return details_of(counts.partition) is None and protocol_of(counts.partition) is None
 
 
-@dataclass(frozen=True)
-class Training:
-    """One training on corrupted images; its levels: clean, then by title and rising severity."""
-
-    label: str
-    levels: tuple[Evaluation, ...]
+# What rgbt robustness measured of one training: see `levels_of`.
+Levels = tuple[Evaluation, ...]
 
 
-def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
-    """The trainings that `text` names (see `open_counts`), with what rgbt robustness measured.
+def trainings(
+    text: str, runs_dir: Path | str = "runs", split: str = ""
+) -> list[tuple[str, Levels]]:
+    """Open what rgbt robustness measured of the trainings that `text` names (see `open_counts`).
 
-    A word may also name a folder that ``rgbt robustness out=...`` wrote. InputError: not measured.
+    A word may also name a folder that ``rgbt robustness out=...`` wrote. Returns the name of the
+    method and the levels of each training. InputError: not measured.
     """
-    found: list[Training] = []
+    found: list[tuple[str, Levels]] = []
     for word in split_list(text, RUNS):
         folder = Path(word).expanduser()
         files = [] if (folder / "config.yaml").exists() else sorted(folder.glob("*.npz"))
         if files:
-            every = [Evaluation(path, Counts.load(path)) for path in files]
-            found.append(Training(folder.name, levels_of(every, folder)))
+            measured = [Evaluation(path, Counts.load(path)) for path in files]
+            found.append((folder.name, levels_of(measured, folder)))
             continue
-        for named in open_counts(word, runs_dir, split):
-            stored = [] if named.run is None else evaluations_of(named.run, named.counts.split)
-            found.append(Training(named.label, levels_of([*stored], named.path.parent)))
+        for opened in open_counts(word, runs_dir, split):
+            measured = []
+            if opened.run is not None:
+                measured = list(evaluations_of(opened.run, opened.counts.split))
+            found.append((opened.label, levels_of(measured, opened.path.parent)))
     return found
 
 
 def row_of(level: Evaluation) -> str:
-    """The corruption, or the single input, of a level; "clean"."""
+    """Return the corruption, or the single input, of a level; "clean"."""
     of = level.counts.measurement
     return of.corruption or (of.view if "view" in of.changed else CLEAN)
 
 
-def levels_of(every: Sequence[Evaluation], folder: Path) -> tuple[Evaluation, ...]:
-    """Clean images first, then single inputs, then corruptions by title and severity.
+def levels_of(measured: Sequence[Evaluation], folder: Path) -> Levels:
+    """Sort clean images first, then single inputs, then corruptions by title and severity.
 
-    InputError: `folder` has none of these, or not both.
+    Other measurements are left out. InputError: `folder` has no clean or no corrupted images.
     """
-    changed = [{k.partition(".")[0] for k in e.counts.measurement.changed} for e in every]
-    # What was changed for all of them, such as the size of the images, is no condition.
-    allowed = {"view", "severity", "corruption"}.union(
-        set.intersection(*changed) if changed else ()
-    )
-    found = [each for each, keys in zip(every, changed, strict=True) if keys <= allowed]
-    is_clean = [row_of(each) == CLEAN for each in found]
+    allowed = {"view", "severity", "corruption"}
+    if (
+        measured
+    ):  # what was changed for all of them, such as the size of the images, is no condition
+        allowed |= set.intersection(*map(_changed, measured))
+    found = [level for level in measured if _changed(level) <= allowed]
+    is_clean = [row_of(level) == CLEAN for level in found]
     if all(is_clean) or not any(is_clean):
         what = "corrupted" if any(is_clean) else "clean"
         raise InputError(f"{folder} has no counts of {what} images; rgbt robustness makes them.")
 
-    def order(each: Evaluation) -> tuple[bool, bool, str, str, float]:
-        of = each.counts.measurement
-        row = row_of(each)
+    def order(level: Evaluation) -> tuple[bool, bool, str, str, float]:
+        of = level.counts.measurement
+        row = row_of(level)
         return row != CLEAN, of.unit != "", of.title or of.label, row, of.severity
 
     return tuple(sorted(found, key=order))
+
+
+def _changed(level: Evaluation) -> set[str]:
+    """Return the fields in which a measurement differs from that of its run, without their keys."""
+    return {field.partition(".")[0] for field in level.counts.measurement.changed}

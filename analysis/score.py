@@ -5,7 +5,6 @@ From a folder of predicted label images, or from the counts that a run has store
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
@@ -42,18 +41,8 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
 SOURCE = "source.txt"
 
 COLUMNS = (
-    "method",
-    "split",
-    "partition",
-    "subset",
-    "images",
-    "region",
-    "class",
-    "metric",
-    "absent",
-    "value",
-    "low",
-    "high",
+    *("method", "split", "partition", "subset", "images", "region", "class", "metric", "absent"),
+    *("value", "low", "high"),
 )
 # Means in the tables; the file of scores holds more.
 SHOWN = (names.MIOU, names.MACC, names.VAR)
@@ -63,7 +52,7 @@ PREDICTION_OPTIONS = ("regions", "resize", "name", "format", "palette", "prefix"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(PredictionFormatOptions, DrawOptions):
+class ScoreOptions(PredictionFormatOptions, DrawOptions):
     """Options of ``rgbt score``."""
 
     predictions: Annotated[
@@ -110,7 +99,7 @@ class Options(PredictionFormatOptions, DrawOptions):
         return f"predictions={Path(self.predictions).resolve()} split={self.split or 'test'}"
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: ScoreOptions, overrides: list[str]) -> int:
     """Score predictions of any method by region, class, day and night, with intervals.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
@@ -128,7 +117,7 @@ def main(options: Options, overrides: list[str]) -> int:
         counted, remarks = _stored_counts(options, overrides), []
     else:
         scored = _scored(options, overrides)
-        counted, remarks = [(scored.name, each) for each in scored.counts], scored.remarks()
+        counted, remarks = [(scored.name, counts) for counts in scored.counts], scored.remarks()
         if out is not None:
             scored.save(out)
     frames, tables = [], []
@@ -142,14 +131,14 @@ def main(options: Options, overrides: list[str]) -> int:
     print_rich(Group(*map(rich_table, tables)))
     print_rich(plain_text("\n".join(remarks)))
     title = "# Scores of " + ", ".join(dict.fromkeys(name for name, _ in counted))
-    lines = [title, "", *(each.to_markdown() for each in tables), *remarks, ""]
+    lines = [title, "", *(table.to_markdown() for table in tables), *remarks, ""]
     texts = {"scores.md": "\n".join(lines), SOURCE: f"{options.source}\n"}
     write_files(out, {**texts, "scores.csv": pd.concat(frames)})
     return 0
 
 
 def scores(name: str, counts: Counts) -> pd.DataFrame:
-    """Every score of counts under both conventions for absent classes, one a row: `COLUMNS`.
+    """Compute every score under both conventions for absent classes, one a row: `COLUMNS`.
 
     See `analysis.results.score_frame`; low and high are NaN.
     """
@@ -157,7 +146,9 @@ def scores(name: str, counts: Counts) -> pd.DataFrame:
 
     from analysis.results import score_frame
 
-    sizes = {"all": len(counts.names)} | {k: len(v.names) for k, v in counts.parts().items()}
+    sizes = {"all": len(counts.names)}
+    for subset, part in counts.parts().items():
+        sizes[subset] = len(part.names)
     both = [score_frame(counts, absent).assign(absent=absent) for absent in get_args(Absent)]
     frame = pd.concat(both, ignore_index=True)
     frame = frame.assign(method=name, split=counts.split, partition=counts.partition)
@@ -166,15 +157,15 @@ def scores(name: str, counts: Counts) -> pd.DataFrame:
 
 
 def conventions(frame: pd.DataFrame, counts: Counts) -> list[Absent]:
-    """Both where one of the means differs between them; else that of the counts alone."""
+    """Return both where one of the means differs between them; else that of the counts alone."""
     means = frame[(frame["class"] == "") & frame["metric"].isin(SHOWN)]
-    one, other = (means.loc[means["absent"] == each, "value"] for each in get_args(Absent))
+    one, other = (means.loc[means["absent"] == absent, "value"] for absent in get_args(Absent))
     same = one.reset_index(drop=True).equals(other.reset_index(drop=True))
     return [counts.absent] if same else [*get_args(Absent)]
 
 
 def add_intervals(frame: pd.DataFrame, counts: Counts, settings: Resampling) -> str:
-    """Fill low and high of mIoU, also of regions, and of Var; says what the intervals are."""
+    """Fill low and high of mIoU, also of regions, and of Var; say what the intervals are."""
     from analysis.uncertainty import estimate
 
     is_bounded = (frame["class"] == "") & frame["metric"].isin((names.MIOU, names.VAR))
@@ -185,7 +176,8 @@ def add_intervals(frame: pd.DataFrame, counts: Counts, settings: Resampling) -> 
             metrics[row.Index] = name if row.subset == "all" else names.subset(row.subset, name)
         found = estimate([counts], [*metrics.values()], replace(settings, absent=absent))
         for index, name in metrics.items():
-            if (interval := found[name].images) is not None:
+            interval = found[name].images
+            if interval is not None:
                 frame.loc[index, ["low", "high"]] = interval.low, interval.high
     evidence = found[names.MIOU].evidence
     return (
@@ -196,7 +188,7 @@ def add_intervals(frame: pd.DataFrame, counts: Counts, settings: Resampling) -> 
 
 
 def score_tables(frame: pd.DataFrame, counts: Counts, said: str = "") -> list[TextTable]:
-    """Means and IoU of each class by region; accuracy of each class by region; day and night.
+    """Show means and IoU of each class by region, accuracy of each class, and day and night.
 
     Means under both conventions for absent classes where these differ; classes without pixels "-".
     """
@@ -229,9 +221,7 @@ def score_tables(frame: pd.DataFrame, counts: Counts, said: str = "") -> list[Te
 
     def grid(title: str, rows: pd.DataFrame, *notes: str) -> TextTable:
         wide = rows.set_index(["label", "column"])["text"].unstack(sort=False)
-        return text_table(
-            f"{head}: {title}", wide.rename_axis(""), [each for each in notes if each]
-        )
+        return text_table(f"{head}: {title}", wide.rename_axis(""), list(filter(None, notes)))
 
     return [
         grid("mIoU, mAcc and IoU of each class by region", pd.concat(ious)),
@@ -269,7 +259,7 @@ def _make_room(out: Path | None, source: str) -> None:
             path.unlink()
 
 
-def _scored(options: Options, overrides: list[str]) -> FolderScores:
+def _scored(options: ScoreOptions, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import ScoringOptions, score_folder
     from rgbt.data.predictions import Affixes, FormatOptions
 
@@ -287,26 +277,26 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _stored_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
 
-    default = Options()
+    default = ScoreOptions()
     idle = [key for key in PREDICTION_OPTIONS if getattr(options, key) != getattr(default, key)]
     idle += [word.partition("=")[0] for word in overrides]
     if idle:
         raise InputError(f"'{idle[0]}' has no effect on stored counts.")
     found = open_counts(options.counts, options.runs_dir, options.split)
-    labels: Sequence[str] = [each.label for each in found]
+    labels = [stored.label for stored in found]
     named = []
-    for each in found:
-        label = each.label
+    for stored in found:
+        label = stored.label
         if labels.count(label) > 1:
-            label = str(each.path) if each.seed is None else f"{label} seed {each.seed}"
-        named.append((label, each.counts))
+            label = str(stored.path) if stored.seed is None else f"{label} seed {stored.seed}"
+        named.append((label, stored.counts))
     return named
 
 
-entry = PlainCommand(Options, main, heeds=("dataset",))
+entry = PlainCommand(ScoreOptions, main, heeds=("dataset",))
 
 if __name__ == "__main__":
     entry()

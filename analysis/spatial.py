@@ -25,7 +25,7 @@ from rgbt.config.plain_command import PlainCommand
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(DrawOptions):
+class SpatialOptions(DrawOptions):
     """Options of ``rgbt spatial``."""
 
     split: Annotated[str, Help("split whose images are measured")] = "train"
@@ -65,7 +65,7 @@ class Options(DrawOptions):
     ] = None
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: SpatialOptions, overrides: list[str]) -> int:
     """Measure a data set by region and print its statistics.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet, or dataset=synth.
@@ -74,32 +74,35 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rich.console import Group
 
-    from analysis.statistics import sample as samples
     from analysis.statistics import tables
-    from analysis.statistics.collect import MeasurementSettings, collect
+    from analysis.statistics.collect import collect
+    from analysis.statistics.resampled import ResampledSplit, no_background, quantities
     from analysis.statistics.statements import judged
     from rgbt.metrics import metric
     from rgbt.terminal import plain_text, print_rich, rich_table
 
     out, way = options.out, (options.estimator, options.average)
     check_out(out)
-    drawn = options.settings()
-    settings = MeasurementSettings(
-        regions=metric.Regions(
-            partition=options.partition,
-            regions=options.regions,
-            aspect=options.aspect if options.partition == "ring" else None,
-            absent="released",
-        ),
-        kernel=options.kernel,
-        short_edge=options.short_edge,
+    settings = options.settings()
+    regions = metric.Regions(
+        partition=options.partition,
+        regions=options.regions,
+        aspect=options.aspect if options.partition == "ring" else None,
+        absent="released",
     )
     dataset = dataset_of(overrides)
     with progress("measuring", len(dataset.names(options.split))) as advance:
-        stats = collect(dataset, options.split, settings, advance)
-    remarks = [] if stats.background else [samples.no_background(stats)]
-    sample = samples.Sample(stats, drawn, way)
-    frame, found = samples.quantities(stats), judged(sample)
+        stats = collect(
+            dataset,
+            options.split,
+            regions,
+            kernel=options.kernel,
+            short_edge=options.short_edge,
+            advance=advance,
+        )
+    remarks = [] if stats.background else [no_background(stats)]
+    sample = ResampledSplit(stats, settings, way)
+    frame, found = quantities(stats), judged(sample)
     # Statements about noise are shown for the chosen estimator and average only.
     is_shown = (found["estimator"] == "") | (found["estimator"] + found["average"] == "".join(way))
     after = [tables.statement_table(found[is_shown], options.level), tables.estimator_table(found)]
@@ -108,14 +111,14 @@ def main(options: Options, overrides: list[str]) -> int:
     print_rich(Group(plain_text("\n".join([heading, *remarks])), *map(rich_table, shown)))
     if out is not None:
         every = [*tables.region_tables(frame, stats), *after]
-        lines = [f"# {heading}", "", *remarks, *(each.to_markdown() for each in every)]
+        lines = [f"# {heading}", "", *remarks, *(table.to_markdown() for table in every)]
         texts = {"statistics.md": "\n".join(lines)}
         write_files(out, {**texts, "regions.csv": frame, "statements.csv": found})
         stats.save(out / "statistics.npz")
     return 0
 
 
-entry = PlainCommand(Options, main, heeds=("dataset",))
+entry = PlainCommand(SpatialOptions, main, heeds=("dataset",))
 
 if __name__ == "__main__":
     entry()

@@ -20,16 +20,18 @@ GROUPS = ("dataset", "metric", "consistency")
 
 
 def _options() -> Iterator[tuple[str, Any, Any]]:
-    """Name, type and default of `figure`, `out`, and the options of all figures."""
+    """Yield name, type and default of `figure`, `out`, and the options of all figures."""
     yield "figure", Annotated[str, Help('name such as spatialseg/fig5; "list": all names')], "list"
     yield "out", Annotated[str, Help("output file: .pdf, .svg or .png (300 dots per inch)")], ""
-    every = [types_of(spec.options) for spec in FIGURES.values()]
-    for name, annotation in {key: kind for each in every for key, kind in each.items()}.items():
+    annotations: dict[str, Any] = {}
+    for spec in FIGURES.values():
+        annotations |= types_of(spec.options)
+    for name, annotation in annotations.items():
         kind, *notes = get_args(annotation)
         yield name, Annotated[(kind | None, *notes)], None
 
 
-Options: Any = make_dataclass("Options", _options(), frozen=True)
+FigureOptions: Any = make_dataclass("FigureOptions", _options(), frozen=True)
 
 
 def main(options: Any, overrides: list[str]) -> int:
@@ -47,19 +49,21 @@ def main(options: Any, overrides: list[str]) -> int:
     given = {key: value for key, value in vars(options).items() if value is not None}
     name, out = given.pop("figure"), given.pop("out")
     if name == "list":
-        rows = {
-            key: (each.shows, " ".join([*each.words, *each.groups]))
-            for key, each in sorted(FIGURES.items())
-        }
+        rows = {}
+        for key, listed_figure in sorted(FIGURES.items()):
+            words = [*listed_figure.words, *listed_figure.groups]
+            rows[key] = listed_figure.shows, " ".join(words)
         listed = pd.DataFrame.from_dict(rows, "index", columns=["shows", "options"])
         print_rich(rich_table(text_table("figures", listed.rename_axis("figure"))))
         return 0
     check_choice("figure", name, FIGURES)
     spec = FIGURES[name]
-    groups = {word: word.lstrip("+~").partition("=")[0].split(".")[0] for word in overrides}
-    known = [each.name for each in fields(spec.options)]
+    known = [option.name for option in fields(spec.options)]
     idle = [key for key in given if key not in known]
-    idle += [group for group in groups.values() if group not in spec.groups]
+    for word in overrides:
+        group = word.lstrip("+~").partition("=")[0].split(".")[0]
+        if group not in spec.groups:
+            idle.append(group)
     if idle:
         near = nearest(idle[0], ["figure", "out", *known, *spec.groups])
         raise InputError(f"'{idle[0]}' has no effect on figure={name}; {near}.")
@@ -75,7 +79,7 @@ def main(options: Any, overrides: list[str]) -> int:
     return 0
 
 
-entry = PlainCommand(Options, main, heeds=GROUPS)
+entry = PlainCommand(FigureOptions, main, heeds=GROUPS)
 
 if __name__ == "__main__":
     entry()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import cached_property
 from inspect import Parameter, signature
@@ -14,8 +14,8 @@ from annotated_types import Interval
 from matplotlib.figure import Figure
 
 from analysis.commands import MOST, dataset_of, progress
-from analysis.results import open_counts
-from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
+from analysis.results import Frames, Levels, open_counts, trainings
+from analysis.statistics.collect import SpatialStatistics, collect
 from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.common_options import RunsDir
@@ -52,9 +52,9 @@ AbsentClasses = Annotated[
 class FigureSpec:
     """One figure.
 
-    `make` takes a `Config` and a dataclass of options, `given`, as far as it has these parameters,
-    and its own options as keywords. `groups` of the configuration take effect; `metric` is the
-    partition unless ``metric=`` is given.
+    `make` takes a `Config` called `config`, dataclasses of options, and further options as
+    keywords, as far as it has these parameters. `groups` of the configuration take effect; `metric`
+    is the partition unless ``metric=`` is given.
     """
 
     make: Callable[..., Drawn]
@@ -66,23 +66,24 @@ class FigureSpec:
     def options(self) -> type[Any]:
         """The dataclass of all options, by the signature of the function."""
         hints = get_type_hints(self.make, include_extras=True)
-        own = [
-            (p.name, hints[p.name], MISSING if p.default is p.empty else p.default)
-            for p in self._keywords
-        ]
-        shared = (hints["given"],) if "given" in hints else ()
-        return make_dataclass("Options", own, bases=shared, frozen=True, kw_only=True)
+        own: list[tuple[str, Any, Any]] = []
+        bases: list[type] = []
+        for parameter in signature(self.make).parameters.values():
+            name = parameter.name
+            if parameter.kind is Parameter.KEYWORD_ONLY:
+                default = MISSING if parameter.default is Parameter.empty else parameter.default
+                own.append((name, hints[name], default))
+            elif name != "config":
+                bases.append(hints[name])
+        return make_dataclass("Options", own, bases=tuple(bases), frozen=True, kw_only=True)
 
     @property
     def words(self) -> list[str]:
         """Names of the options; those without a default are followed by "=..."."""
-        every = fields(self.options)
-        return [f"{each.name}{'=...' * (each.default is MISSING)}" for each in every]
-
-    @property
-    def _keywords(self) -> list[Parameter]:
-        every = signature(self.make).parameters.values()
-        return [each for each in every if each.kind is Parameter.KEYWORD_ONLY]
+        found = []
+        for option in fields(self.options):
+            found.append(f"{option.name}=..." if option.default is MISSING else option.name)
+        return found
 
     def __call__(self, config: Config, values: Mapping[str, Any]) -> Drawn:
         """Draw with the values of options that were given; InputError where one is missing."""
@@ -90,19 +91,20 @@ class FigureSpec:
             if word.endswith("=...") and word[:-4] not in values:
                 raise InputError(f"the figure needs {word}")
         given = self.options(**values)
-        known = signature(self.make).parameters
-        shared = {"config": config, "given": given}
-        named = {name: value for name, value in shared.items() if name in known}
-        return self.make(
-            **named, **{each.name: getattr(given, each.name) for each in self._keywords}
-        )
+        arguments: dict[str, Any] = {}
+        for name, parameter in signature(self.make).parameters.items():
+            if parameter.kind is Parameter.KEYWORD_ONLY:
+                arguments[name] = getattr(given, name)
+            else:
+                arguments[name] = config if name == "config" else given
+        return self.make(**arguments)
 
 
 FIGURES: dict[str, FigureSpec] = {}
 
 
 def figure(name: str, shows: str, *groups: str, metric: str = "ring5") -> Callable[[Make], Make]:
-    """Decorator that registers a figure; see `FigureSpec`."""
+    """Register a function as a figure, as a decorator; see `FigureSpec`."""
 
     def register(make: Make) -> Make:
         FIGURES[name] = FigureSpec(make, shows, groups, metric)
@@ -119,11 +121,11 @@ class Config:
     defaults: Mapping[str, str] = field(default_factory=dict)
 
     def chooses(self, group: str) -> bool:
-        """Whether a file of the group was chosen."""
+        """Say whether a file of the group was chosen."""
         return any(word.lstrip("+~").startswith(f"{group}=") for word in self.overrides)
 
     def built(self, node: str, *more: str) -> Any:
-        """The object of one node of the configuration."""
+        """Build the object of one node of the configuration."""
         usual = [f"{key}={name}" for key, name in self.defaults.items() if not self.chooses(key)]
         return built(node, [*usual, *self.overrides, *more])
 
@@ -139,7 +141,7 @@ class Config:
         return regions
 
     def names(self, names: str, split: str, number: int = 1) -> list[str]:
-        """The named images of a split, else its first `number`; see `chosen_names`."""
+        """Return the named images of a split, else its first `number`; see `chosen_names`."""
         return chosen_names(names, self.dataset.names(split or "test"), number)
 
 
@@ -154,7 +156,7 @@ class StatisticsOptions:
     split: Split = ""
 
     def open(self, config: Config, *, by_region: bool = False) -> SpatialStatistics:
-        """The statistics.
+        """Load the statistics, or measure them.
 
         Raises:
             InputError: a file and a data set, or a file of another split than requested; or,
@@ -166,9 +168,9 @@ class StatisticsOptions:
                 "or dataset=... to measure one now."
             )
         if not self.statistics:
-            split, settings = self.split or "train", MeasurementSettings(regions=config.regions)
+            split = self.split or "train"
             with progress("measuring", len(config.dataset.names(split))) as advance:
-                return collect(config.dataset, split, settings, advance)
+                return collect(config.dataset, split, config.regions, advance=advance)
         path = file_in(self.statistics, "statistics.npz")
         stored = SpatialStatistics.load(path)
         check_split(self.split, stored.split, path)
@@ -192,23 +194,31 @@ class RunOptions:
     split: Split = ""
     absent: AbsentClasses = None
 
-    def open(self, opened: Callable[..., Any], *more: Any) -> dict[str, list[Any]]:
-        """Label -> what `opened` gives for (run, folder of runs, split), of each entry."""
-        found: dict[str, list[Any]] = {}
-        for word in split_list(self.runs, "runs"):
-            label, colon, place = word.partition(":")
-            for each in opened(place if colon else word, self.runs_dir, self.split, *more):
-                found.setdefault(label if colon else each.label, []).append(each)
+    def counts(self, frames: Frames = "") -> dict[str, list[Counts]]:
+        """Open the counts of the seeds of each method, by its label."""
+        found: dict[str, list[Counts]] = {}
+        for label, word in self._entries():
+            for opened in open_counts(word, self.runs_dir, self.split, frames):
+                found.setdefault(label or opened.label, []).append(opened.counts)
         return found
 
-    def counts(self, *frames: str) -> dict[str, list[Counts]]:
-        """Label -> counts of its seeds."""
-        opened = self.open(open_counts, *frames).items()
-        return {label: [each.counts for each in named] for label, named in opened}
+    def trainings(self) -> dict[str, list[Levels]]:
+        """Open what rgbt robustness measured of the seeds of each method, by its label."""
+        found: dict[str, list[Levels]] = {}
+        for label, word in self._entries():
+            for own_label, levels in trainings(word, self.runs_dir, self.split):
+                found.setdefault(label or own_label, []).append(levels)
+        return found
+
+    def _entries(self) -> Iterator[tuple[str, str]]:
+        """Yield the label ("": its own) and the name of each entry."""
+        for word in split_list(self.runs, "runs"):
+            label, colon, place = word.partition(":")
+            yield (label, place) if colon else ("", word)
 
 
 def chosen_names(names: str, known: Sequence[str], number: int) -> list[str]:
-    """The names that a list with commas holds, else the first `number` of those that are known.
+    """Return the names of a list with commas, else the first `number` of those that are known.
 
     Raises:
         InputError: an unknown name, or fewer images than requested.
@@ -223,7 +233,7 @@ def chosen_names(names: str, known: Sequence[str], number: int) -> list[str]:
 
 
 def labelled(text: str) -> dict[str, Path]:
-    """Label -> place, of ``label:place,label:place``; InputError: an empty entry or label twice."""
+    """Read ``label:place,label:place``; InputError: an empty entry, or a label twice."""
     found: dict[str, Path] = {}
     for entry in split_list(text, "methods"):
         label, colon, place = entry.partition(":")
@@ -235,19 +245,20 @@ def labelled(text: str) -> dict[str, Path]:
 
 
 def open_scored(methods: str, partition: str) -> dict[str, Counts]:
-    """Label -> counts over a partition, of folders of ``rgbt score`` or files.
+    """Load counts over a partition by label, of folders of ``rgbt score`` or files.
 
     Raises:
         InputError: there are none, or of different images.
     """
-    places = labelled(methods).items()
-    found = {label: Counts.load(file_in(each, f"counts_{partition}.npz")) for label, each in places}
+    found = {}
+    for label, place in labelled(methods).items():
+        found[label] = Counts.load(file_in(place, f"counts_{partition}.npz"))
     check_same_images(found.values())
     return found
 
 
 def check_same_images(every: Iterable[Counts], *, alike: bool = True) -> Counts:
-    """The first counts; InputError: others on other images, or by other classes or regions.
+    """Return the first counts; InputError: others on other images, by other classes or regions.
 
     With `alike`, a warning says what differs between the measurements beside the networks.
     """
@@ -279,6 +290,6 @@ def check_split(wanted: str, stored: str, source: object) -> None:
 
 
 def file_in(place: Path | str, name: str) -> Path:
-    """A file, or the one called `name` in a folder that the other commands wrote."""
+    """Return the path of a file, or of `name` in a folder that the other commands wrote."""
     path = Path(place).expanduser()
     return path / name if path.is_dir() else path

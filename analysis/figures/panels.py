@@ -45,11 +45,13 @@ from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.pair_list import ListedPair, read_list
 from rgbt.metrics.scores import miou
 from rgbt.tracking.pictures import colours
-from rgbt.types import IGNORE
+from rgbt.types import IGNORE, Sample
 
 if TYPE_CHECKING:
+    import torch
+
     from rgbt.dataset import LabelledDataset
-    from rgbt.types import AnyMasker, Sample
+    from rgbt.types import AnyMasker
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -72,6 +74,8 @@ HIDDEN = (150, 190, 230)
 
 
 Rows = Annotated[Count, Help("number of images")]
+PairFolder = Annotated[str, Help("folder that rgbt consistency export=... wrote")]
+ViewSet = Annotated[Count, Help("set of virtual views of these pairs, from 1")]
 Layout = Annotated[
     Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
 ]
@@ -94,18 +98,10 @@ class PictureOptions(PredictionFormatOptions):
         return FormatOptions(form=self.format, palette=self.palette, affixes=affixes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairOptions(PictureOptions):
-    """Pairs of frames."""
-
-    pairs: Annotated[str, Help("folder that rgbt consistency export=... wrote")]
-    view_set: Annotated[Count, Help("set of virtual views of these pairs, from 1")] = 1
-
-
 def read_prediction(
     folder: Path, reader: PredictionReader, name: str, image_hw: tuple[int, ...]
 ) -> Bytes:
-    """(H, W) class indices; InputError: no such file, or of another size than the image."""
+    """Read (H, W) class indices; InputError: no such file, or of another size than the image."""
     path = folder / f"{reader.options.affixes.file_stem(name)}.png"
     if not path.is_file():
         raise InputError(f"methods: there is no prediction {path}.")
@@ -120,7 +116,7 @@ def read_prediction(
 @figure("spatialseg/fig9", "qualitative results on another data set", "dataset", "metric")
 @figure("crm/fig4", "qualitative results", "dataset", "metric")
 def qualitative(config: Config, given: PictureOptions) -> Drawn:
-    """RGB, thermal, ground truth and predictions, with a white box on the centre."""
+    """Show RGB, thermal, ground truth and predictions, with a white box on the centre."""
     shown, regions = config.names(given.names, given.split, given.rows), config.regions
     if regions.aspect is None:
         raise InputError(f"metric: {regions.name} has no centre to put a box on; use rings.")
@@ -147,15 +143,18 @@ def missing(
     without_thermal: Annotated[str, Help("the same with corruption=removed:thermal")],
     rows: Rows = 2,
 ) -> Drawn:
-    """CRM, Fig. 2, with the mIoU of every prediction; InputError: methods differ."""
+    """Show CRM, Fig. 2, with the mIoU of every prediction; InputError: methods differ."""
     three = {
         "both": labelled(given.methods),
         "no RGB": labelled(without_rgb),
         "no thermal": labelled(without_thermal),
     }
-    if any(set(each) != set(three["both"]) for each in three.values()):
+    if any(set(folders) != set(three["both"]) for folders in three.values()):
         raise InputError("methods: name the same ones in methods, without_rgb and without_thermal.")
-    every = {f"{label}\n{kind}": three[kind][label] for label in three["both"] for kind in three}
+    every = {}
+    for label in three["both"]:
+        for kind, folders in three.items():
+            every[f"{label}\n{kind}"] = folders[label]
     shown = config.names(given.names, given.split, rows)
     made, cells, frame = panel(config.dataset, every, shown, given.form, given.layout)
     for axes, score in zip(cells[:, 3:].flat, frame["mIoU"], strict=True):
@@ -170,11 +169,11 @@ def panel(
     form: FormatOptions,
     layout: str = "rows",
 ) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
-    """The pictures of a panel, one row per name: the figure, its axes, and the mIoU of each image.
+    """Draw the pictures of a panel, a row per name; return the figure, its axes, and the mIoU.
 
-    The mIoU is in percent, over the scored classes that label or prediction hold, because a single
-    image lacks most classes. InputError: images without label or of several sizes, or a missing
-    prediction.
+    The mIoU of each image is in percent, over the scored classes that label or prediction hold,
+    because a single image lacks most classes. InputError: images without label or of several sizes,
+    or a missing prediction.
     """
     reader = PredictionReader(dataset.classes, dataset.palette, form)
     palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
@@ -188,7 +187,7 @@ def panel(
             score = float(100 * miou(counts, "exclude", scored))
             numbers.append((name, method.replace("\n", " "), score))
         thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
-        pictures.append([sample.rgb, thermal, *(colours(each, palette) for each in painted)])
+        pictures.append([sample.rgb, thermal, *(colours(classes, palette) for classes in painted)])
     check_one_size([row[0].shape for row in pictures])
     titles = ["RGB", "thermal", "ground truth", *folders]
     legend: plots.Legend = (dataset.classes, palette, ())
@@ -197,7 +196,7 @@ def panel(
 
 
 def labelled_sample(dataset: LabelledDataset, name: str) -> tuple[Sample, Bytes]:
-    """A sample and its label; InputError where it has none."""
+    """Read a sample and its label; InputError where it has none."""
     sample = dataset.read(name)
     if sample.label is None:
         raise InputError(f"names: '{name}' has no label; choose images that are labelled.")
@@ -210,23 +209,15 @@ def check_one_size(sizes: Sequence[tuple[int, ...]]) -> None:
         raise InputError(f"names: the images have different sizes {sorted(set(sizes))}.")
 
 
-class Frame(NamedTuple):
-    """One frame with labels: (H, W, 3), (H, W) and (H, W) uint8; 255: no label."""
-
-    rgb: Bytes
-    thermal: Bytes
-    label: Bytes
-
-
 class FramePair(NamedTuple):
-    """A pair of frames and the predictions of M methods.
+    """A pair of labelled frames and the predictions of M methods.
 
-    All are (H, W): `compared` are pixels of the second frame that count, which are seen in the
-    first one and labelled; `differ`, for each method, those whose two predictions differ.
+    The masks are (H, W): `compared` are pixels of the second frame that count, which are seen in
+    the first one and labelled; `differ`, for each method, those whose two predictions differ.
     """
 
-    name: str
-    frames: tuple[Frame, Frame]
+    first: Sample
+    second: Sample
     predictions: tuple[tuple[Bytes, Bytes], ...]
     differ: tuple[Mask, ...]
     compared: Mask
@@ -235,92 +226,115 @@ class FramePair(NamedTuple):
     def shares(self) -> tuple[float, ...]:
         """Percent of the compared pixels that differ, for each method; NaN where none is."""
         count = int(self.compared.sum())
-        return tuple(100 * int(each.sum()) / count if count else math.nan for each in self.differ)
+        if count == 0:
+            return (math.nan,) * len(self.differ)
+        return tuple(100 * int(mask.sum()) / count for mask in self.differ)
 
 
-class Pairs:
-    """The pairs of an export, with the predictions of methods; pixels count as in TC.
+def read_pairs(
+    config: Config, given: PictureOptions, pairs: str, view_set: int
+) -> tuple[list[FramePair], str]:
+    """Read the chosen pairs of an export with the predictions of methods; pixels count as in TC.
 
-    Raises:
-        InputError: an export of other images or views, or an unfinished one.
+    Returns also what the second frames are: "synthesised" or "next frame". InputError: an export
+    of other images or views, or an unfinished one.
     """
-
-    def __init__(self, config: Config, given: PairOptions) -> None:
-        self._folder, self._dataset = Path(given.pairs).expanduser(), config.dataset
-        self.methods, listed = labelled(given.methods), read_list(self._folder)
-        self._after = NextFrames(self._dataset) if listed.frames == "next" else None
-        self.second, self._views = "synthesised", config.built("consistency")
-        made_of = self._views.mark or "published"
-        if self._after is not None:
-            self.second, made_of = "next frame", self._after.dataset.fingerprint()[:6]
-        if not listed.complete:
-            raise InputError(f"pairs: the export {given.pairs} was interrupted; rerun its command.")
-        if (listed.dataset, listed.views) != (self._dataset.fingerprint(), made_of):
-            raise InputError(
-                f"pairs: {given.pairs} was exported from other images or other second frames "
-                f"({listed.name}, {listed.views}); give the data set and the consistency settings "
-                "of the export."
-            )
-        self.listed = {each.first: each for each in listed.pairs if each.set == given.view_set}
-        if not self.listed:
-            raise InputError(f"view_set={given.view_set}: the export has no such set of views.")
-        self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, given.form)
-
-    def read(self, name: str) -> FramePair:
-        """The pair whose first frame is called `name`."""
-        pair = self.listed[name]
-        sample, of_first = labelled_sample(self._dataset, name)
-        label, (rows, columns), compared = self._follow(pair, of_first)
-        rgb = read_rgb(self._folder / "rgb" / f"{pair.second}.png")
-        thermal = np.asarray(decode(self._folder / "thermal" / f"{pair.second}.png"), np.uint8)
+    folder, dataset = Path(pairs).expanduser(), config.dataset
+    methods, listed = labelled(given.methods), read_list(folder)
+    views, following = config.built("consistency"), None
+    what, made_of = "synthesised", views.mark or "published"
+    if listed.frames == "next":
+        following = NextFrames(dataset)
+        what, made_of = "next frame", following.dataset.fingerprint()[:6]
+    if not listed.complete:
+        raise InputError(f"pairs: the export {pairs} was interrupted; rerun its command.")
+    if (listed.dataset, listed.views) != (dataset.fingerprint(), made_of):
+        raise InputError(
+            f"pairs: {pairs} was exported from other images or other second frames "
+            f"({listed.name}, {listed.views}); give the data set and the consistency settings "
+            "of the export."
+        )
+    of_set = {pair.first: pair for pair in listed.pairs if pair.set == view_set}
+    if not of_set:
+        raise InputError(f"view_set={view_set}: the export has no such set of views.")
+    reader, found = PredictionReader(dataset.classes, dataset.palette, given.form), []
+    for name in chosen_names(given.names, [*of_set], given.rows):
+        pair = of_set[name]
+        first, of_first = labelled_sample(dataset, name)
+        if following is None:
+            label, source, compared = _seen_in_view(views.view, pair, of_first)
+        else:
+            label, source, compared = _seen_next(following, pair, of_first)
+        rgb = read_rgb(folder / "rgb" / f"{pair.second}.png")
+        thermal = np.asarray(decode(folder / "thermal" / f"{pair.second}.png"), np.uint8)
         predictions, differ = [], []
-        for folder in self.methods.values():
-            first = read_prediction(folder, self._reader, name, label.shape)
-            second = read_prediction(folder, self._reader, pair.second, label.shape)
-            predictions.append((first, second))
-            differ.append((first[rows, columns] != second) & compared)
-        frames = Frame(sample.rgb, sample.thermal, of_first), Frame(rgb, thermal, label)
-        return FramePair(name, frames, tuple(predictions), tuple(differ), compared)
+        for of_method in methods.values():
+            earlier = read_prediction(of_method, reader, name, label.shape)
+            later = read_prediction(of_method, reader, pair.second, label.shape)
+            predictions.append((earlier, later))
+            differ.append((earlier[source] != later) & compared)
+        second = Sample(rgb=rgb, thermal=thermal, label=label, name=pair.second)
+        found.append(FramePair(first, second, tuple(predictions), tuple(differ), compared))
+    return found, what
 
-    def _follow(
-        self, pair: ListedPair, of_first: Bytes
-    ) -> tuple[Bytes, tuple[NDArray[np.int64], NDArray[np.int64]], Mask]:
-        """Label of the second frame, rows and columns of its pixels in the first, which count."""
-        shape = of_first.shape
-        if self._after:
-            _, label = labelled_sample(self._after.dataset, pair.first)
-            rows, columns = self._after.source(pair.first, (shape[0], shape[1]))
-            return label, (rows.clip(0), columns.clip(0)), (rows >= 0) & (label != IGNORE)
-        import torch
 
-        view = self._views.view
-        angles = torch.tensor([[pair.yaw, pair.pitch, pair.roll]], dtype=torch.float64)
-        warp = view.warp(angles, shape)
-        label = warp.nearest(torch.from_numpy(of_first)[None], view.outside_label)[0].numpy()
-        places = torch.arange(label.size).view(1, *shape)
-        rows, columns = np.divmod(warp.nearest(places, 0)[0].numpy(), shape[1])
-        return label, (rows, columns), warp.inside()[0].numpy() & (label != IGNORE)
+# Label of the second frame, rows and columns of its pixels in the first, and which of them count.
+Seen = tuple[Bytes, tuple[NDArray[np.int64], NDArray[np.int64]], Mask]
+
+
+def _seen_next(following: NextFrames, pair: ListedPair, of_first: Bytes) -> Seen:
+    shape = of_first.shape
+    _, label = labelled_sample(following.dataset, pair.first)
+    rows, columns = following.source(pair.first, (shape[0], shape[1]))
+    return label, (rows.clip(0), columns.clip(0)), (rows >= 0) & (label != IGNORE)
+
+
+def _seen_in_view(view: Any, pair: ListedPair, of_first: Bytes) -> Seen:
+    import torch
+
+    angles = torch.tensor([[pair.yaw, pair.pitch, pair.roll]], dtype=torch.float64)
+    warp = view.warp(angles, of_first.shape)
+    label = warp.nearest(torch.from_numpy(of_first)[None], view.outside_label)[0].numpy()
+    places = torch.arange(label.size).view(1, *of_first.shape)
+    rows, columns = np.divmod(warp.nearest(places, 0)[0].numpy(), of_first.shape[1])
+    return label, (rows, columns), warp.inside()[0].numpy() & (label != IGNORE)
 
 
 @figure("temporal/fig1", "a real frame and its synthesised next one", "dataset", "consistency")
-def pair_rows(config: Config, given: PairOptions, *, rows: Rows = 1) -> Drawn:
-    """Both frames, ground truth and predictions; pixels that lower TC are outlined."""
-    opened = Pairs(config, given)
-    methods = [*opened.methods]
-    shown = [opened.read(name) for name in chosen_names(given.names, [*opened.listed], rows)]
+def pair_rows(
+    config: Config,
+    given: PictureOptions,
+    *,
+    pairs: PairFolder,
+    view_set: ViewSet = 1,
+    rows: Rows = 1,
+) -> Drawn:
+    """Show both frames, ground truth and predictions; pixels that lower TC are outlined."""
+    shown, second = read_pairs(config, replace(given, rows=rows), pairs, view_set)
     check_one_size([pair.compared.shape for pair in shown])
-    palette = np.array(config.dataset.palette, np.uint8)
+    methods = [*labelled(given.methods)]
     line = Line2D([], [], color=OUTLINE, linewidth=1.2, label=OUTLINED)
-    legend = config.dataset.classes, palette, [line]
-    cells = [(p.name, *each) for p in shown for each in zip(methods, p.shares, strict=True)]
-    frame = pd.DataFrame(cells, columns=["image", "method", "differing_percent"])
-    return draw_pairs(shown, methods, legend, opened.second, given.layout), frame
+    legend = config.dataset.classes, np.array(config.dataset.palette, np.uint8), [line]
+    numbers = []
+    for pair in shown:
+        for method, share in zip(methods, pair.shares, strict=True):
+            numbers.append((pair.first.name, method, share))
+    frame = pd.DataFrame(numbers, columns=["image", "method", "differing_percent"])
+    return draw_pairs(shown, methods, legend, second, given.layout), frame
 
 
 @figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
-def pair_columns(config: Config, given: PairOptions, *, layout: Layout = "columns") -> Drawn:
-    """The frames of `pair_rows` in the layout of the printed figure."""
-    return pair_rows(config, replace(given, layout=layout), rows=given.rows)
+def pair_columns(
+    config: Config,
+    given: PictureOptions,
+    *,
+    pairs: PairFolder,
+    view_set: ViewSet = 1,
+    layout: Layout = "columns",
+) -> Drawn:
+    """Show the frames of `pair_rows` in the layout of the printed figure."""
+    given = replace(given, layout=layout)
+    return pair_rows(config, given, pairs=pairs, view_set=view_set, rows=given.rows)
 
 
 @plots.styled
@@ -331,18 +345,19 @@ def draw_pairs(
     second: str,
     layout: str,
 ) -> Figure:
-    """Pictures of both frames of every pair; below them the classes; `second`: what they are."""
+    """Draw both frames of every pair, and the classes below; `second`: what second frames are."""
     pictures, labels = [], []
     for pair in pairs:
         # Both frames of a pair share the limits, so that a colour means the same in both.
-        low, high = int(pair.frames[0].thermal.min()), int(pair.frames[0].thermal.max())
-        for index, frame in enumerate(pair.frames):
-            painted = [frame.label, *(both[index] for both in pair.predictions)]
-            relative = ((frame.thermal.astype(float) - low) / max(high - low, 1)).clip(0, 1)
+        low, high = int(pair.first.thermal.min()), int(pair.first.thermal.max())
+        for index, sample in enumerate((pair.first, pair.second)):
+            assert sample.label is not None, "pairs are labelled"
+            painted = [sample.label, *(both[index] for both in pair.predictions)]
+            relative = ((sample.thermal.astype(float) - low) / max(high - low, 1)).clip(0, 1)
             thermal = (255 * colormaps[THERMAL_COLOURS](relative)[..., :3]).astype(np.uint8)
-            maps = [colours(each, legend[1]) for each in painted]
-            pictures.append([frame.rgb, thermal, *maps])
-        labels += [pair.name, second]
+            maps = [colours(classes, legend[1]) for classes in painted]
+            pictures.append([sample.rgb, thermal, *maps])
+        labels += [pair.first.name, second]
     titles = ("RGB", "thermal", "ground truth", *methods)
     made, cells = plots.picture_grid(pictures, labels, titles, layout, legend)
     for pair, of_pair in zip(pairs, cells[1::2], strict=True):
@@ -357,18 +372,6 @@ def draw_pairs(
     return made
 
 
-class MaskExample(NamedTuple):
-    """One mask on a pair of images: (H, W, 3) pictures with hidden pixels in the colour `HIDDEN`,
-    and (H, W) which pixels are hidden.
-    """
-
-    title: str
-    rgb: Bytes
-    thermal: Bytes
-    rgb_hidden: Mask
-    thermal_hidden: Mask
-
-
 @figure("crm/fig5", "masks on a pair of images: a square, and patches of four sizes", "dataset")
 def masks(
     config: Config,
@@ -377,55 +380,53 @@ def masks(
     split: Split = "",
     seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the masks")] = 0,
 ) -> Drawn:
-    """CRM, Fig. 5: RGB above, thermal below; what one image hides, the other shows."""
+    """Show CRM, Fig. 5: RGB above, thermal below; what one image hides, the other shows."""
+    from rgbt.randomness import torch_generator
+
     sample = config.dataset.read(config.names(names, split)[0])
-    chosen = masker_overrides(PATCHES).items()
-    maskers = {title: config.built("masker", *words) for title, words in chosen}
-    examples = mask_examples(sample, maskers, math.lcm(STRIDE, *PATCHES), seed)
-    pictures = [[each.rgb for each in examples], [each.thermal for each in examples]]
-    made, _ = plots.picture_grid(pictures, ("RGB", "thermal"), [*maskers])
-    rows = [(e.title, e.rgb_hidden.mean(), e.thermal_hidden.mean()) for e in examples]
+    chosen, multiple = masker_overrides(PATCHES), math.lcm(STRIDE, *PATCHES)
+    above, below, rows = [], [], []
+    for index, (title, words) in enumerate(chosen.items()):
+        generator = torch_generator(seed, "figure masks", index)
+        masker = config.built("masker", *words)
+        (rgb, thermal), hidden = under_mask(sample, masker, multiple, generator)
+        above.append(rgb)
+        below.append(thermal)
+        rows.append((title, hidden[0].mean(), hidden[1].mean()))
+    made, _ = plots.picture_grid([above, below], ("RGB", "thermal"), [*chosen])
     return made, pd.DataFrame(rows, columns=["mask", "rgb_hidden", "thermal_hidden"])
 
 
 def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
-    """Title -> what chooses the masker of each column of Fig. 5: a square, then the patches."""
-    by_size = {
-        f"{size} x {size} pixels": ("masker=crm", f"masker.patch_size={size}") for size in patches
-    }
-    every = {"square": ("masker=square",), **by_size}
-    return {title: (*words, "masker.pairing=comp") for title, words in every.items()}
+    """Return what chooses the masker of each column of Fig. 5, by title: a square, then patches."""
+    chosen: dict[str, tuple[str, ...]] = {"square": ("masker=square",)}
+    for size in patches:
+        chosen[f"{size} x {size} pixels"] = ("masker=crm", f"masker.patch_size={size}")
+    return {title: (*words, "masker.pairing=comp") for title, words in chosen.items()}
 
 
-def mask_examples(
-    sample: Sample, maskers: Mapping[str, AnyMasker], multiple: int, seed: int
-) -> tuple[MaskExample, ...]:
-    """The pair under each mask, cut around its centre to whole cells: 64 does not divide 480.
+def under_mask(
+    sample: Sample, masker: AnyMasker, multiple: int, generator: torch.Generator
+) -> tuple[Bytes, Mask]:
+    """Hide what a mask hides of RGB and of thermal, cut around the centre to whole cells.
 
-    Every cell divides `multiple` pixels; a mask is drawn from the seed and its place among the
-    maskers. InputError: the images are smaller than one cell.
+    Every cell divides `multiple` pixels; the centre is cut out because 64 does not divide 480.
+    Returns pictures (2, H, W, 3) with hidden pixels in the colour `HIDDEN`, and which pixels are
+    hidden (2, H, W). InputError: the images are smaller than one cell.
     """
     import torch
-
-    from rgbt.randomness import torch_generator
 
     full = sample.thermal.shape
     height, width = (length // multiple * multiple for length in full)
     if min(height, width) == 0:
         raise InputError(f"patches: '{sample.name}' has {full} pixels, less than {multiple}.")
     top, left = (full[0] - height) // 2, (full[1] - width) // 2
-    rgb, thermal = (
-        image[top : top + height, left : left + width] for image in (sample.rgb, sample.thermal)
-    )
-    centre = torch.tensor([[height // 2, width // 2]])
-    examples = []
-    for index, (title, masker) in enumerate(maskers.items()):
-        pair = masker((height, width), centre, torch_generator(seed, "figure masks", index))
-        shown = [rgb.copy(), np.repeat(thermal[..., None], 3, axis=2)]
-        hidden: list[Mask] = []
-        for image, cells in zip(shown, (pair.rgb[0].numpy(), pair.thermal[0].numpy()), strict=True):
-            size = height // cells.shape[0], width // cells.shape[1]
-            hidden.append(np.kron(cells, np.ones(size, bool)))
-            image[hidden[-1]] = HIDDEN
-        examples.append(MaskExample(title, shown[0], shown[1], hidden[0], hidden[1]))
-    return tuple(examples)
+    thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
+    pictures = np.stack([sample.rgb, thermal])[:, top : top + height, left : left + width]
+    mask = masker((height, width), torch.tensor([[height // 2, width // 2]]), generator)
+    hidden = np.zeros((2, height, width), bool)
+    for index, cells in enumerate((mask.rgb[0].numpy(), mask.thermal[0].numpy())):
+        size = height // cells.shape[0], width // cells.shape[1]
+        hidden[index] = np.kron(cells, np.ones(size, bool))
+    pictures[hidden] = HIDDEN
+    return pictures, hidden

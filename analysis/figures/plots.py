@@ -49,16 +49,7 @@ SUFFIXES = (".pdf", ".svg", ".png")
 
 # Okabe and Ito's, the strong ones first; grey and olive (Tol) instead of their yellow, which is
 # lost as a thin line on white, and of black, which stands for what is set apart.
-COLOURS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#777777",
-    "#999933",
-)
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777", "#999933")
 
 APART = "black"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
@@ -71,14 +62,14 @@ styled = rc_context(
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of `width` x `height` inches that makes room for its labels."""
+    """Make an empty figure of `width` x `height` inches that makes room for its labels."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def out_path(out: str) -> Path:
-    """The file that ``out=`` names; InputError for another ending, or where none can be written."""
+    """Return the file that ``out=`` names; InputError: another ending, or it cannot be written."""
     path = Path(out).expanduser()
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"out={out}: expected a name that ends in {', '.join(SUFFIXES)}.")
@@ -99,7 +90,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def series_style(index: int) -> dict[str, Any]:
-    """Colour, marker and line of series `index`; no two of the first 32 agree in all three."""
+    """Return colour, marker and line of a series; no two of the first 32 agree in all three."""
     turn, place = divmod(index, len(COLOURS))
     return {
         "color": COLOURS[place],
@@ -116,7 +107,7 @@ def line_plot(
     bars: bool = False,
     spread: float = 0.0,
 ) -> None:
-    """A line for each series of (series, x, value, low, high), with an interval where it is known.
+    """Draw a line for each series of (series, x, value, low, high), with its known intervals.
 
     `styles` differ from `series_style`. Intervals are bars or bands; `spread`: series stand side
     by side over this part of x, so that no bars overlap.
@@ -137,7 +128,7 @@ def line_plot(
 
 
 def dot_plot(axes: Axes, frame: pd.DataFrame, *, open_low: bool = False) -> None:
-    """Points over words, of (series, tick, value, low, high), with a bar between known ends.
+    """Draw points over words, of (series, tick, value, low, high), with a bar between known ends.
 
     Series stand side by side; with `open_low` the low end has an open marker.
     """
@@ -152,7 +143,7 @@ def dot_plot(axes: Axes, frame: pd.DataFrame, *, open_low: bool = False) -> None
         axes.plot(x, rows["value"], label=name, **how)
         if open_low:
             axes.plot(x, rows["low"], markerfacecolor="white", **how)
-    axes.set_xticks(range(len(ticks)), [readable(each).replace(" (", "\n(") for each in ticks])
+    axes.set_xticks(range(len(ticks)), [readable(tick).replace(" (", "\n(") for tick in ticks])
     axes.set_xlim(-0.5, len(ticks) - 0.5)
     axes.grid(visible=False, axis="x")
 
@@ -165,7 +156,7 @@ def heat(
     inches: float = COLUMN,
     **how: Any,
 ) -> Artist:
-    """A heat map (H, W), or an image (H, W, 3) uint8, without ticks and frame.
+    """Draw a heat map (H, W), or an image (H, W, 3) uint8, without ticks and frame.
 
     `borders`: (H, W) regions; lines between them, dark below bright, show on any picture, and
     `numbers`, a text for each, on a white ground. `inches`: width of the picture.
@@ -189,7 +180,7 @@ def heat(
 
 
 def staircase(region_map: NDArray[np.integer], step: int) -> list[tuple[int, int] | None]:
-    """(row, column) for a text in each region; None for an empty one.
+    """Return (row, column) for a text in each region; None for an empty one.
 
     Rings are too narrow for texts one above the other: they go `step` pixels further to the left
     and to the right in turn, as far as their ring reaches.
@@ -221,7 +212,7 @@ def picture_grid(
     layout: str = "rows",
     legend: Legend | None = None,
 ) -> tuple[Figure, NDArray[Any]]:
-    """Pictures across a page, all of the same size, (H, W, 3) uint8, with a legend below.
+    """Draw pictures across a page, all of the same size, (H, W, 3) uint8, with a legend below.
 
     A row per name and a column per title, or, with "columns", the other way round. Returns the
     figure, and the axes of every name and title, whatever the layout.
@@ -244,9 +235,9 @@ def picture_grid(
     figure.set_layout_engine("compressed", w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
     axes = figure.subplots(len(down), len(across), squeeze=False)
     by_name = axes.T if is_columns else axes
-    for each, pictures in zip(by_name, rows, strict=True):
-        for one, picture in zip(each, pictures, strict=True):
-            heat(one, picture)
+    for of_name, pictures in zip(by_name, rows, strict=True):
+        for cell_axes, picture in zip(of_name, pictures, strict=True):
+            heat(cell_axes, picture)
     for one, text in zip(axes[0], above, strict=True):
         one.set_title(text)
     for one, text in zip(axes[:, 0], down, strict=True):
@@ -258,21 +249,21 @@ def picture_grid(
 
 
 def in_corner(axes: Axes, text: str) -> None:
-    """A short text in the lower right corner of a picture, on a white ground."""
+    """Write a short text in the lower right corner of a picture, on a white ground."""
     box = {"boxstyle": "square,pad=0.15", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
     at: Any = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
     axes.text(0.985, 0.02, text, fontsize=TINY, bbox=box, **at)
 
 
 def region_axis(axes: Axes, regions: int, label: str = "region") -> None:
-    """A horizontal axis with a tick at each of the regions 1..R."""
+    """Make a horizontal axis with a tick at each of the regions 1..R."""
     axes.set_xticks(range(1, regions + 1, max(1, -(-regions // 12))))
     axes.set_xlim(0.6, regions + 0.4)
     axes.set_xlabel(label)
 
 
 def series_legend(figure: Figure, axes: Axes, columns: int) -> None:
-    """The legend of one of the panels, below all of them; long labels in fewer columns."""
+    """Draw the legend of one panel below all of them; long labels in fewer columns."""
     handles, labels = axes.get_legend_handles_labels()
     width = figure.get_figwidth()
     fitting = int(width * LETTERS_PER_INCH / (max(map(len, labels)) + HANDLE_LETTERS))
@@ -283,11 +274,11 @@ def series_legend(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def folded(text: str, inches: float) -> str:
-    """`text` on as many lines as it needs to stand within `inches`; its own lines stay apart."""
+    """Break `text` into lines of at most `inches`; its own lines stay apart."""
     width = max(8, int(inches * LETTERS_PER_INCH))
     return "\n".join(textwrap.fill(line, width) for line in text.split("\n"))
 
 
 def readable(name: str) -> str:
-    """A class name as text: "car_stop" -> "car stop"."""
+    """Write a class name as text: "car_stop" -> "car stop"."""
     return name.replace("_", " ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,13 +16,8 @@ from numpy.typing import NDArray
 
 from analysis.commands import DrawOptions
 from analysis.figures import plots
-from analysis.figures.inputs import (
-    Drawn,
-    RunOptions,
-    check_same_images,
-    figure,
-)
-from analysis.results import Training, row_of, trainings
+from analysis.figures.inputs import Drawn, RunOptions, check_same_images, figure
+from analysis.results import Evaluation, Levels, row_of
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.corruption_node import row_name
@@ -68,7 +63,7 @@ def consistency(
         ),
     ] = "aligned",
 ) -> Drawn:
-    """TC and CA by class, of counts of pairs of frames (rgbt consistency)."""
+    """Draw TC and CA by class, of counts of pairs of frames (rgbt consistency)."""
     frame = class_consistency(given.counts(frames), given.absent)
     return draw_consistency(frame), frame
 
@@ -76,7 +71,7 @@ def consistency(
 def class_consistency(
     methods: Mapping[str, Sequence[Counts]], absent: Absent | None
 ) -> pd.DataFrame:
-    """TC (value) and CA (low, by the union of the protocol) of variants by class, mean over seeds.
+    """Compute TC (value) and CA (low, by the union of the protocol) by class, means over seeds.
 
     Both are in percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the
     cells of the paper's Table I. InputError: counts of single frames, or of different kinds.
@@ -89,27 +84,28 @@ def class_consistency(
     labels = class_labels(reference.classes, reference.unscored)
     scored, rows = scored_classes(reference.classes, reference.unscored), []
     for label, seeds in methods.items():
-        metrics = [
-            [names.of_class(k, each) for k in reference.classes] for each in HEADLINES[protocol]
-        ]
-        both_ = [[[value(m, each, convened) for m in of] for of in metrics] for each in seeds]
-        tc, ca = np.mean(both_, axis=0)
+        by_score = []
+        for score in HEADLINES[protocol]:
+            metrics = [names.of_class(name, score) for name in reference.classes]
+            of_seeds = [[value(metric, counts, convened) for metric in metrics] for counts in seeds]
+            by_score.append(np.mean(of_seeds, axis=0))
+        tc, ca = by_score
         means = float(class_mean(tc, scored)), float(class_mean(ca, scored))
-        rows += [(protocol, label, *cells, *means) for cells in zip(labels, tc, ca, strict=True)]
+        for cells in zip(labels, tc, ca, strict=True):
+            rows.append((protocol, label, *cells, *means))
     columns = ["protocol", "series", "tick", "value", "low", "mean_tc", "mean_ca"]
     return pd.DataFrame(rows, columns=columns).assign(high=math.nan)
 
 
 @plots.styled
 def draw_consistency(frame: pd.DataFrame) -> Figure:
-    """TC as full and CA as open marker, joined by a line; variants side by side in each class."""
+    """Draw TC as full and CA as open marker, joined by a line; variants side by side."""
     made = plots.new_figure(plots.PAGE, 2.6)
     axes = made.subplots()
     protocol: Protocol = frame["protocol"][0]
-    said = [
-        f"{name} (TC {tc:.1f}, CA {ca:.1f})"
-        for name, tc, ca in frame[["series", "mean_tc", "mean_ca"]].to_numpy()
-    ]
+    said = []
+    for name, tc, ca in frame[["series", "mean_tc", "mean_ca"]].to_numpy():
+        said.append(f"{name} (TC {tc:.1f}, CA {ca:.1f})")
     plots.dot_plot(axes, frame.assign(series=said), open_low=True)
     axes.set_ylim(bottom=0)
     union = " (released)" if HEADLINES[protocol][1] == names.CA_RELEASED else ""
@@ -131,54 +127,42 @@ def robustness(
         Help("relative: in percent of what each training reaches on clean images"),
     ] = "mIoU",
 ) -> Drawn:
-    """Mean over trainings, band of one standard deviation, of runs after rgbt robustness."""
+    """Draw means over trainings and bands of one standard deviation, after rgbt robustness."""
     rows = split_list(corruptions, "corruptions") if corruptions else []
-    frame = corrupted(given.open(trainings), given.absent, rows)
+    frame = corrupted(given.trainings(), given.absent, rows)
     return draw_robustness(frame, score), frame
 
 
 def corrupted(
-    methods: Mapping[str, Sequence[Training]], absent: Absent | None, rows: Sequence[str] = ()
+    methods: Mapping[str, Sequence[Levels]], absent: Absent | None, rows: Sequence[str] = ()
 ) -> pd.DataFrame:
-    """Scores of the trainings of methods under corruptions, those called `rows`, or all.
+    """Compute the scores of the trainings of methods under corruptions, called `rows`, or all.
 
     mIoU and relative are means over trainings, in percent, and in percent of what each training
     reaches on clean images; mIoU_sd and relative_sd standard deviations (n - 1; NaN of one).
     InputError: methods on other images or at different severities, or a row not measured.
     """
-    levels = [
-        (method, number, level)
-        for method, each in methods.items()
-        for number, training in enumerate(each)
-        for level in training.levels
-    ]
-    check_same_images((level.counts for *_, level in levels), alike=False)
-    convened = absent or convention(level.counts for *_, level in levels)
+    every: list[tuple[str, int, Evaluation]] = []
+    for method, seeds in methods.items():
+        for number, levels in enumerate(seeds):
+            every += [(method, number, level) for level in levels]
+    all_counts = [level.counts for _, _, level in every]
+    check_same_images(all_counts, alike=False)
+    convened = absent or convention(all_counts)
     cells = []
-    for method, number, level in levels:
+    for method, number, level in every:
         score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
         of = level.counts.measurement
         row = row_of(level)
         about = row, of.title or (CLEAN if row == CLEAN else of.label), of.unit, of.severity
         cells.append((*about, method, number, float(score)))
     names_ = ["row", "title", "unit", "severity", "method", "training", "mIoU"]
-    every = pd.DataFrame(cells, columns=names_)
-    known = [row for row in every["row"].unique() if row != CLEAN]
-    shown = [row_name(row) for row in rows] or known
-    for row in shown or [""]:
-        if row not in known:
-            raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
-    every = every[every["row"].isin([CLEAN, *shown])]
-    ladders = every[every["unit"] != ""].groupby(["row", "method", "training"])["severity"]
-    for row, each in ladders.agg(list).groupby("row"):
-        if each.map(str).nunique() > 1:
-            found = "; ".join(f"{key[1]} {severities}" for key, severities in each.items())
-            raise InputError(f"runs: {row} was measured at different severities: {found}.")
-    clean = every[every["row"] == CLEAN].set_index(["method", "training"])["mIoU"]
-    places = pd.MultiIndex.from_frame(every[["method", "training"]])
-    every["relative"] = 100 * every["mIoU"] / clean.reindex(places).to_numpy()
+    scores = _shown_rows(pd.DataFrame(cells, columns=names_), rows)
+    clean = scores[scores["row"] == CLEAN].set_index(["method", "training"])["mIoU"]
+    places = pd.MultiIndex.from_frame(scores[["method", "training"]])
+    scores["relative"] = 100 * scores["mIoU"] / clean.reindex(places).to_numpy()
     keys = ["row", "title", "unit", "severity", "method"]
-    found = every.groupby(keys, sort=False, as_index=False).agg(
+    found = scores.groupby(keys, sort=False, as_index=False).agg(
         seeds=("training", "size"),
         mIoU=("mIoU", "mean"),
         mIoU_sd=("mIoU", "std"),
@@ -192,9 +176,25 @@ def corrupted(
     return found
 
 
+def _shown_rows(scores: pd.DataFrame, rows: Sequence[str]) -> pd.DataFrame:
+    """Keep clean images and the chosen corruptions; refuse severities that differ (InputError)."""
+    known = [row for row in scores["row"].unique() if row != CLEAN]
+    shown = [row_name(row) for row in rows] or known
+    for row in shown or [""]:
+        if row not in known:
+            raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
+    chosen = scores[scores["row"].isin([CLEAN, *shown])].copy()
+    ladders = chosen[chosen["unit"] != ""].groupby(["row", "method", "training"])["severity"]
+    for row, of_row in ladders.agg(list).groupby("row"):
+        if of_row.map(str).nunique() > 1:
+            found = "; ".join(f"{key[1]} {severities}" for key, severities in of_row.items())
+            raise InputError(f"runs: {row} was measured at different severities: {found}.")
+    return chosen
+
+
 @plots.styled
 def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
-    """One panel per corruption; the dashed line is the score on clean images.
+    """Draw one panel per corruption; the dashed line is the score on clean images.
 
     Corruptions without a severity, such as missing images, stand side by side below.
     """
@@ -223,14 +223,15 @@ def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
         first = first or axes
         panel = others[others["row"] == row] if row else missing
         panel = pd.concat([clean, panel]).sort_values(
-            "series", key=lambda each: each.map(order.index), kind="stable"
+            "series", key=lambda series: series.map(order.index), kind="stable"
         )
-        for number, each in enumerate(clean["value"]):
+        for number, score_on_clean in enumerate(clean["value"]):
             colour = plots.series_style(number)["color"]
-            axes.axhline(each, color=colour, linestyle="--", linewidth=0.6, zorder=1)
+            axes.axhline(score_on_clean, color=colour, linestyle="--", linewidth=0.6, zorder=1)
         if row:  # dashes are for clean images
             plots.line_plot(axes, panel, {name: {"linestyle": "-"} for name in order})
-            axes.set_xticks(panel["x"].unique(), [f"{each:g}" for each in panel["x"].unique()])
+            severities = panel["x"].unique()
+            axes.set_xticks(severities, [f"{severity:g}" for severity in severities])
             axes.set_xlabel(panel["unit"].iloc[-1], fontsize=plots.SMALL)
         else:
             plots.dot_plot(axes, panel)
@@ -248,21 +249,16 @@ def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
 
 @figure("regions/heat", "mIoU of each region as a heat map, one per method")
 def region_heat(given: RunOptions) -> Drawn:
-    """Regions painted by their mIoU."""
+    """Paint regions by their mIoU."""
     frame = region_means(given.counts(), given.absent)
     return draw_heat(frame, MAP_HW), frame
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProfileOptions(RunOptions, DrawOptions):
-    """Counts of runs, with intervals."""
-
-
 @figure("regions/profile", "mIoU by region with intervals, one line per method")
-def region_profile(given: ProfileOptions) -> Drawn:
-    """MIoU over the regions with bands: intervals over images, and over seeds where several."""
-    frame = region_means(given.counts(), given.absent, given.settings())
-    return draw_profiles(frame, given.level), frame
+def region_profile(given: RunOptions, drawn: DrawOptions) -> Drawn:
+    """Draw mIoU over the regions with intervals over images, and over seeds where several."""
+    frame = region_means(given.counts(), given.absent, drawn.settings())
+    return draw_profiles(frame, drawn.level), frame
 
 
 def region_means(
@@ -270,7 +266,7 @@ def region_means(
     absent: Absent | None,
     settings: Resampling | None = None,
 ) -> pd.DataFrame:
-    """MIoU by region (value) and of the image of methods, mean over seeds, in percent.
+    """Compute mIoU by region (value) and of the image of methods, mean over seeds, in percent.
 
     Intervals are over images and seeds where there are several seeds, else over images; without
     `settings` there are none. InputError: counts that do not belong together.
@@ -280,14 +276,16 @@ def region_means(
     regions = [names.region(region) for region in range(1, reference.counts.shape[1] + 1)]
     for label, seeds in methods.items():
         kind = "both" if len(seeds) > 1 else "images"
-        metrics = (*regions, names.MIOU)
-        means = [float(np.mean([value(m, each, convened) for each in seeds])) for m in metrics]
+        means = []
+        for metric in (*regions, names.MIOU):
+            of_seeds = [value(metric, counts, convened) for counts in seeds]
+            means.append(float(np.mean(of_seeds)))
         ends, covers = [(math.nan, math.nan)] * len(regions), "nothing"
         if settings is not None:
             found = estimate(seeds, regions, replace(settings, absent=convened))
             intervals = [getattr(found[name], kind) for name in regions]
             if None not in intervals:
-                ends = [(each.low, each.high) for each in intervals]
+                ends = [(interval.low, interval.high) for interval in intervals]
                 covers = "images and seeds" if kind == "both" else kind
         about = means.pop(), len(seeds), len(seeds[0].names), covers
         for region, (mean, bounds) in enumerate(zip(means, ends, strict=True), 1):
@@ -298,7 +296,7 @@ def region_means(
 
 @plots.styled
 def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
-    """MIoU over the regions, one line per method, with the mIoU of the image in the legend.
+    """Draw mIoU over the regions, a line per method, with the mIoU of the image in the legend.
 
     Intervals of one or two methods are bands; those of more are bars side by side, because bands
     would hide each other.
@@ -306,19 +304,18 @@ def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
     methods = frame.drop_duplicates("series")
     made = plots.new_figure(plots.COLUMN, 2.4 + plots.LINE * len(methods))
     axes = made.subplots()
-    styles = {
-        str(row.series): {"label": f"{row.series} (mIoU {row.mIoU:.1f})"}
-        for row in methods.itertuples()
-    }
+    styles = {}
+    for row in methods.itertuples():
+        styles[str(row.series)] = {"label": f"{row.series} (mIoU {row.mIoU:.1f})"}
     is_crowded = len(methods) > 2
     plots.line_plot(axes, frame, styles, bars=is_crowded, spread=SPREAD * is_crowded)
     plots.region_axis(axes, frame["x"].max(), f"region ({frame['partition'][0]})")
     axes.set_ylabel("mIoU (%)")
     # The title says, for example, "95 % intervals over images and seeds", above their numbers.
-    numbers = [
-        f"{' or '.join(map(str, sorted(set(many))))} {word}{'' if set(many) == {1} else 's'}"
-        for word, many in (("seed", methods["seeds"]), ("image", methods["images"]))
-    ]
+    numbers = []
+    for word, column in (("seed", "seeds"), ("image", "images")):
+        counted = sorted(set(methods[column]))
+        numbers.append(f"{' or '.join(map(str, counted))} {word if counted == [1] else column}")
     title = f"{100 * level:g} % intervals over {' or '.join(methods['covers'].unique())}"
     axes.set_title(f"{title}\n{', '.join(numbers)}", fontsize=plots.SMALL)
     plots.series_legend(made, axes, columns=1)
@@ -327,25 +324,25 @@ def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
 
 @plots.styled
 def draw_heat(frame: pd.DataFrame, image_hw: tuple[int, int]) -> Figure:
-    """One (H, W) map per method with the mIoU of each region written into it, in one scale."""
+    """Draw one (H, W) map per method with the mIoU of each region written into it."""
     methods = [*frame.groupby("series", sort=False)]
-    low, high = colour_limits([each / 100 for each in frame["value"]])
+    low, high = colour_limits((frame["value"] / 100).tolist())
     region_map = map_of(frame["partition"][0], image_hw)
     height, width = image_hw
     columns = 2 if len(methods) == 4 else min(3, len(methods))
     rows = -(-len(methods) // columns)
     page = plots.COLUMN if columns == 1 else plots.PAGE
     panel = (page - 0.6) / columns
-    titles = [
-        f"{plots.folded(str(name), panel - 0.2)}\nmIoU {each['mIoU'].iloc[0]:.1f}"
-        for name, each in methods
-    ]
+    titles = []
+    for name, of_method in methods:
+        folded = plots.folded(str(name), panel - 0.2)
+        titles.append(f"{folded}\nmIoU {of_method['mIoU'].iloc[0]:.1f}")
     lines = 1 + max(title.count("\n") for title in titles)
     tall = rows * (panel * height / width + 0.06 + plots.LINE * lines)
     made = plots.new_figure(page, tall + 0.05)
     panels = made.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (_, each), title in zip(panels, methods, titles, strict=False):
-        values = each["value"].to_numpy()
+    for axes, (_, of_method), title in zip(panels, methods, titles, strict=False):
+        values = of_method["value"].to_numpy()
         numbers = ["-" if math.isnan(number) else f"{number:.1f}" for number in values]
         picture = values[region_map]
         shown: Any = plots.heat(axes, picture, region_map, numbers, panel, vmin=low, vmax=high)
@@ -358,7 +355,7 @@ def draw_heat(frame: pd.DataFrame, image_hw: tuple[int, int]) -> Figure:
 
 
 def map_of(partition: str, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
-    """The map of a partition by the name that counts carry ("ring5", "ring9_released_3_4").
+    """Return the map of a partition by the name in counts ("ring5", "ring9_released_3_4").
 
     Raises:
         InputError: no such partition, or an image too small for it.
@@ -375,7 +372,7 @@ def map_of(partition: str, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
 @figure("multihead/fig3", "gradients of entropy minimisation and maximum squares loss")
 @plots.styled
 def gradients() -> Drawn:
-    """Both curves over the probability; analytic, without input."""
+    """Draw both curves over the probability; analytic, without input."""
     frame = gradient_curves()
     made = plots.new_figure(plots.COLUMN, 2.3)
     axes = made.subplots()
@@ -387,7 +384,7 @@ def gradients() -> Drawn:
 
 
 def gradient_curves(points: int = 999) -> pd.DataFrame:
-    """The two gradients of one pixel with two classes of probability p and 1 - p.
+    """Compute the two gradients of one pixel with two classes of probability p and 1 - p.
 
         entropy          E = -(p log p + (1 - p) log(1 - p)) / log 2,  |dE/dp| = |log2(p / (1 - p))|
         maximum squares  M = -(p^2 + (1 - p)^2) / 2,                   |dM/dp| = |2 p - 1|

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,8 +23,8 @@ from analysis.figures import inputs, plots
 from analysis.figures.inputs import Config, Drawn, StatisticsOptions, figure
 from analysis.predictions.maps import PixelMaps
 from analysis.statistics.collect import ALL, MODALITIES, SpatialStatistics
-from analysis.statistics.sample import (
-    Sample,
+from analysis.statistics.resampled import (
+    ResampledSplit,
     Values,
     check_background,
     normalised,
@@ -55,21 +54,21 @@ SPREAD = 0.5
 # A logarithmic axis where one modality's median is more than this many times the other's.
 FAR_APART = 5.0
 
+# Numbers below a map of Fig. 1, fields of `Heat`.
+NUMBERS = ("centre", "edge", "image")
+
 # Resamples for the bars of Figs. 5 and 6.
 RESAMPLING = Resampling(resamples=2000)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapOptions(StatisticsOptions):
-    """Pixel maps, or statistics."""
+Maps = Annotated[str, Help("output of rgbt score: folder or maps.npz")]
 
-    maps: Annotated[str, Help("output of rgbt score: folder or maps.npz")] = ""
 
-    def open_maps(self, split: str) -> PixelMaps:
-        """The maps; InputError: of another split."""
-        maps = PixelMaps.load(inputs.file_in(self.maps, "maps.npz"))
-        inputs.check_split(split, maps.split, self.maps)
-        return maps
+def open_maps(maps: str, split: str) -> PixelMaps:
+    """Load pixel maps; InputError: of another split."""
+    found = PixelMaps.load(inputs.file_in(maps, "maps.npz"))
+    inputs.check_split(split, found.split, maps)
+    return found
 
 
 class Heat(NamedTuple):
@@ -90,7 +89,9 @@ class Heat(NamedTuple):
 
 
 def iou_heat(maps: PixelMaps, regions: Regions, images: str = "") -> Heat:
-    """Pixel-level IoU, mean over classes (Fig. 1a), over rings; `images`: which, where it matters.
+    """Compute pixel-level IoU, mean over classes (Fig. 1a), and its numbers over rings.
+
+    `images`: which images, where it matters.
 
     The map excludes classes that never occur at a pixel; in a ring they count as `regions` says.
     """
@@ -109,7 +110,7 @@ def iou_heat(maps: PixelMaps, regions: Regions, images: str = "") -> Heat:
 
 
 def occupancy_heat(stats: SpatialStatistics, regions: Regions, part: str = ALL) -> Heat:
-    """Sample occupancy rate of the images of a part (Fig. 1b; Eq. 1), over rings (Eq. 2)."""
+    """Compute the sample occupancy rate of a part (Fig. 1b; Eq. 1), and over rings (Eq. 2)."""
     values = occupancy_map(stats, part)
     region_map = ring_map(regions, values.shape)
     by_region = 100 * occupancy_over(stats, region_map, part)
@@ -122,7 +123,7 @@ def occupancy_heat(stats: SpatialStatistics, regions: Regions, part: str = ALL) 
 def occupancy_over(
     stats: SpatialStatistics, region_map: NDArray[np.uint8], part: str = ALL
 ) -> Values:
-    """(R,), sample occupancy rate (Eq. 2) over any regions, also others than were measured."""
+    """Compute the sample occupancy rate (R,) (Eq. 2), also of regions that were not measured."""
     check_background(stats)
     index = region_map.ravel()
     pixels = [np.bincount(index, of_class.ravel()) for of_class in stats.occupied_in(part)]
@@ -130,7 +131,7 @@ def occupancy_over(
 
 
 def ring_map(regions: Regions, image_hw: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The map of a partition that has a centre; InputError where it has none."""
+    """Return the map of a partition that has a centre; InputError where it has none."""
     if regions.partition != "ring":
         raise InputError(f"metric: {regions.name} has no centre and no edge; use rings.")
     return regions.map((image_hw[0], image_hw[1]))
@@ -143,14 +144,16 @@ def ring_map(regions: Regions, image_hw: tuple[int, ...]) -> NDArray[np.uint8]:
     "metric",
 )
 @plots.styled
-def heats(config: Config, given: MapOptions, *, part: inputs.Part = "all") -> Drawn:
-    """One panel per map with its three numbers, and one scale from 0 to 1 for all."""
+def heats(
+    config: Config, given: StatisticsOptions, *, maps: Maps = "", part: inputs.Part = "all"
+) -> Drawn:
+    """Draw one panel per map with its three numbers, and one scale from 0 to 1 for all."""
     shown, has_statistics = [], bool(given.statistics) or config.chooses("dataset")
-    if not has_statistics and (part != ALL or not given.maps):
+    if not has_statistics and (part != ALL or not maps):
         raise InputError(f"statistics: needed for part={part} or without maps=...")
-    if given.maps:
-        maps = given.open_maps("" if has_statistics else given.split)
-        shown.append(iou_heat(maps, config.regions, "all images" if part != ALL else ""))
+    if maps:
+        opened = open_maps(maps, "" if has_statistics else given.split)
+        shown.append(iou_heat(opened, config.regions, "all images" if part != ALL else ""))
     if has_statistics:
         shown.append(occupancy_heat(given.open(config), config.regions, part))
     height, width = shown[0].values.shape
@@ -158,18 +161,19 @@ def heats(config: Config, given: MapOptions, *, part: inputs.Part = "all") -> Dr
     panel = (page - (0.8 if len(shown) > 1 else 0.6)) / len(shown)
     made = plots.new_figure(page, panel * height / width + 0.62)
     panels = made.subplots(1, len(shown), squeeze=False)[0]
-    for letter, axes, each in zip("ab", panels, shown, strict=False):
+    where = f"centre, edge: inner and outer region of {config.regions.name}, pixels pooled"
+    for letter, axes, panel_map in zip("ab", panels, shown, strict=False):
         # The borders of centre and edge alone: 0 centre, 1 between, 2 edge.
-        is_edge = each.region_map == each.region_map.max()
-        borders = (each.region_map > 0).astype(np.uint8) + is_edge
-        image: Any = plots.heat(axes, each.values, borders, vmin=0, vmax=1)
-        axes.set_title(f"({letter}) {each.what}: {each.source}"[0 if len(shown) > 1 else 4 :])
-        numbers = ", ".join(f"{name} {getattr(each, name):.1f} %" for name in Heat._fields[-3:])
-        where = f"centre, edge: inner and outer region of {config.regions.name}, pixels pooled"
-        axes.set_xlabel(f"{each.measure}: {numbers}\n{where}", fontsize=plots.SMALL)
-    label = " or ".join(each.what for each in shown)
+        is_edge = panel_map.region_map == panel_map.region_map.max()
+        borders = (panel_map.region_map > 0).astype(np.uint8) + is_edge
+        image: Any = plots.heat(axes, panel_map.values, borders, vmin=0, vmax=1)
+        title = f"{panel_map.what}: {panel_map.source}"
+        axes.set_title(f"({letter}) {title}" if len(shown) > 1 else title)
+        numbers = ", ".join(f"{name} {getattr(panel_map, name):.1f} %" for name in NUMBERS)
+        axes.set_xlabel(f"{panel_map.measure}: {numbers}\n{where}", fontsize=plots.SMALL)
+    label = " or ".join(panel_map.what for panel_map in shown)
     made.colorbar(image, ax=[*panels], shrink=0.8, pad=0.015, label=label)
-    return made, pd.DataFrame(shown)[["what", "source", "measure", *Heat._fields[-3:]]]
+    return made, pd.DataFrame(shown)[["what", "source", "measure", *NUMBERS]]
 
 
 @figure("spatialseg/fig2", "IoU, accuracy and occupancy over strips and rings", "dataset")
@@ -181,9 +185,12 @@ def trends(
     regions: Annotated[inputs.Count, Help("number of regions of each partition")] = 5,
     absent: inputs.AbsentClasses = None,
 ) -> Drawn:
-    """How the scores change over three partitions."""
-    counts = {each: inputs.open_scored(methods, f"{each}{regions}") for each in TRENDS}
-    convened = absent or convention(c for each in counts.values() for c in each.values())
+    """Draw how the scores change over three partitions."""
+    counts, every = {}, list[Counts]()
+    for partition in TRENDS:
+        counts[partition] = inputs.open_scored(methods, f"{partition}{regions}")
+        every += counts[partition].values()
+    convened = absent or convention(every)
     stats, first = given.open(config), next(iter(counts["ring"].values()))
     inputs.check_one_dataset(stats, first)
     frames, (height, width) = [], stats.region_map.shape
@@ -198,7 +205,7 @@ def trends(
 def trend(
     partition: str, occupancy: Values, methods: Mapping[str, Counts], absent: Absent
 ) -> pd.DataFrame:
-    """IoU and accuracy of methods beside the sample occupancy, over the regions of a partition.
+    """Compute IoU and accuracy of methods, and the sample occupancy, by region of a partition.
 
     IoU and accuracy of a region are means over the scored classes, of the pixels of all images.
     Whether the paper counts the background is not stated; here it counts, as in its tables.
@@ -210,11 +217,13 @@ def trend(
         summed = counts.by_region()
         series["IoU", f"IoU ({label})"] = miou(summed, absent, counts.scored)
         series["Acc", f"Acc ({label})"] = class_mean(recall(summed, absent), counts.scored)
-    rows = [
-        (partition, *name, region, score, score - 100 * scores[0])
-        for name, scores in sorted(series.items(), key=lambda each: -"SAI".index(each[0][0][0]))
-        for region, score in enumerate(100 * scores, 1)
-    ]
+    rows = []
+    for kind in ("IoU", "Acc", "SOR"):
+        for name, scores in series.items():
+            if name[0] != kind:
+                continue
+            for region, score in enumerate(100 * scores, 1):
+                rows.append((partition, *name, region, score, score - 100 * scores[0]))
     columns = ["partition", "kind", "series", "x", "score", "value"]
     return pd.DataFrame(rows, columns=columns).assign(low=math.nan, high=math.nan)
 
@@ -229,7 +238,7 @@ def check_partition(label: str, counts: Counts, partition: str) -> None:
 
 @plots.styled
 def draw_trends(frame: pd.DataFrame, splits: tuple[str, str]) -> Figure:
-    """One panel per partition; methods by colour, IoU in full and accuracy in open markers."""
+    """Draw a panel per partition; methods by colour, IoU in full and accuracy in open markers."""
     made = plots.new_figure(plots.PAGE, 2.5)
     panels = made.subplots(1, len(TRENDS), sharey=True, squeeze=False)[0]
     styles = {"SOR": {"color": plots.APART, "linestyle": ":", "marker": "*", "ms": 5}}
@@ -250,7 +259,7 @@ def draw_trends(frame: pd.DataFrame, splits: tuple[str, str]) -> Figure:
 
 
 def note_splits(made: Figure, occupancy: str, scores: str) -> None:
-    """A note above the figure where occupancy and scores are of different splits."""
+    """Write above the figure that occupancy and scores are of different splits, if they are."""
     if scores not in ("", occupancy):
         made.suptitle(f"SOR: split {occupancy}; scores: split {scores}", fontsize=plots.SMALL)
 
@@ -270,7 +279,7 @@ def classes(
     part: inputs.Part = "all",
     absent: inputs.AbsentClasses = None,
 ) -> Drawn:
-    """Where the samples of each class lie, beside the mIoU of each region."""
+    """Draw where the samples of each class lie, beside the mIoU of each region."""
     stats, method = given.open(config, by_region=True), None
     if methods:
         method, *others = inputs.open_scored(methods, stats.partition).items()
@@ -290,12 +299,12 @@ def class_regions(
     method: tuple[str, Counts] | None = None,
     absent: Absent | None = None,
 ) -> pd.DataFrame:
-    """The series of Fig. 3: share_kr = 100 SOR_kr / max_r SOR_kr, and the mIoU of a method.
+    """Compute the series of Fig. 3: share_kr = 100 SOR_kr / max_r SOR_kr, and the mIoU of a method.
 
     The mIoU is over all scored classes with the background, which the paper does not state. NaN: a
     class that occurs nowhere. InputError: counts over other regions, or a part without images.
     """
-    shares = 100 * normalised(Sample(stats).classes(part)[0])
+    shares = 100 * normalised(ResampledSplit(stats).classes(part)[0])
     series = {stats.classes[index]: shares[index] for index in stats.objects}
     if method is not None:
         label, counts = method
@@ -307,13 +316,15 @@ def class_regions(
                 raise InputError(f"part={part}: the counts of '{label}' contain no such image.")
         scores = miou(counts.by_region(), absent or counts.absent, counts.scored)
         series[f"mIoU ({label})"] = 100 * scores
-    rows = [(name, x, each) for name, values in series.items() for x, each in enumerate(values, 1)]
+    rows = []
+    for name, values in series.items():
+        rows += [(name, region, number) for region, number in enumerate(values, 1)]
     return pd.DataFrame(rows, columns=["series", "x", "value"]).assign(low=math.nan, high=math.nan)
 
 
 @plots.styled
 def draw_classes(frame: pd.DataFrame, regions: str) -> Figure:
-    """One line per class, and the mIoU as a thick black line, all in percent on one axis."""
+    """Draw a line per class, and the mIoU as a thick black line, all in percent on one axis."""
     made = plots.new_figure(plots.PAGE, 2.8)
     axes, more, styles = made.subplots(), "", dict[str, dict[str, Any]]()
     for name, rows in frame.groupby("series"):
@@ -337,14 +348,16 @@ def draw_classes(frame: pd.DataFrame, regions: str) -> Figure:
     metric="ring9",
 )
 @plots.styled
-def regions(config: Config, given: MapOptions, *, names: inputs.Names = "") -> Drawn:
-    """The regions numbered from 1 over a picture."""
-    if bool(given.maps) == config.chooses("dataset"):
+def regions(
+    config: Config, given: StatisticsOptions, *, maps: Maps = "", names: inputs.Names = ""
+) -> Drawn:
+    """Draw the regions numbered from 1 over a picture."""
+    if bool(maps) == config.chooses("dataset"):
         raise InputError("maps: give one of maps=... and dataset=...")
     picture: NDArray[Any]
     what, how = "", {"vmin": 0, "vmax": 1}
-    if given.maps:
-        opened = given.open_maps(given.split)
+    if maps:
+        opened = open_maps(maps, given.split)
         picture, what = opened.iou(), f"IoU ({opened.name}, {opened.split})"
     else:
         picture = config.dataset.read(config.names(names, given.split)[0]).rgb
@@ -369,8 +382,8 @@ def regions(config: Config, given: MapOptions, *, names: inputs.Names = "") -> D
     metric="ring9",
 )
 def laplacian(config: Config, given: StatisticsOptions) -> Drawn:
-    """Laplacian variance by region (Eq. 3), mean over images."""
-    sample = Sample(given.open(config, by_region=True), RESAMPLING)
+    """Draw the Laplacian variance by region (Eq. 3), mean over images."""
+    sample = ResampledSplit(given.open(config, by_region=True), RESAMPLING)
     frame = by_region(sample, "laplacian")
     return draw_by_region(frame, sample, "Laplacian variance\n(squared grey levels)"), frame
 
@@ -394,14 +407,14 @@ def snr(
         Literal["pooled", "images"], Help("signal-to-noise ratio over images: pooled or images")
     ] = "pooled",
 ) -> Drawn:
-    """Signal-to-noise ratio by region (Eq. 4)."""
-    sample = Sample(given.open(config, by_region=True), RESAMPLING, (estimator, average))
+    """Draw the signal-to-noise ratio by region (Eq. 4)."""
+    sample = ResampledSplit(given.open(config, by_region=True), RESAMPLING, (estimator, average))
     frame = by_region(sample, "snr")
     return draw_by_region(frame, sample, f"signal-to-noise ratio ({estimator})"), frame
 
 
-def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
-    """A quantity of the images by region, with 95 % intervals over blocks of images (NaN: few)."""
+def by_region(sample: ResampledSplit, quantity: str) -> pd.DataFrame:
+    """Compute a quantity by region, with 95 % intervals over blocks of images (NaN: too few)."""
     rows = []
     for index, modality in enumerate(MODALITIES):
         for part in sample.stats.subsets():
@@ -415,8 +428,8 @@ def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
 
 
 @plots.styled
-def draw_by_region(frame: pd.DataFrame, sample: Sample, measure: str) -> Figure:
-    """Six lines with intervals: modality by colour, part by marker and line."""
+def draw_by_region(frame: pd.DataFrame, sample: ResampledSplit, measure: str) -> Figure:
+    """Draw six lines with intervals: modality by colour, part by marker and line."""
     made = plots.new_figure(plots.COLUMN, 3.1)
     axes, styles = made.subplots(), {}
     for name, modality, part in frame[["series", "modality", "part"]].drop_duplicates().to_numpy():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -77,7 +76,7 @@ class PixelMaps:
         return cls(palette=palette, **arrays, **plain)
 
     def iou(self) -> NDArray[np.float64]:
-        """Mean IoU over classes at every pixel, over the images: the map of SpatialSeg, Fig. 1(a).
+        """Compute the mean IoU over classes at every pixel: the map of SpatialSeg, Fig. 1(a).
 
             (1 / |C|) sum_{c in C} I_c(y, x) / U_c(y, x)
 
@@ -98,30 +97,13 @@ class PixelMaps:
         return heat
 
 
-class MapSum:
-    """Adds images to pixel maps, from several threads at once; all of the size of the first.
+def add_image(sums: NDArray[np.int32], label: Bytes, prediction: Bytes) -> None:
+    """Count one image, (H, W) each, in the intersection and union (2, K, H, W).
 
-    Attributes:
-        sums: (2, K, H, W) intersection and union; None before the first image.
-        is_one_size: no image had another size, and was so left out.
+    Pixels whose label is no class are left out.
     """
-
-    def __init__(self, num_classes: int) -> None:
-        self.num_classes = num_classes
-        self.sums: NDArray[np.int32] | None = None
-        self.is_one_size = True
-        self._lock = threading.Lock()
-
-    def add(self, label: Bytes, prediction: Bytes) -> None:
-        """Count one image: (H, W) each; pixels whose label is no class are left out."""
-        with self._lock:
-            if self.sums is None:
-                self.sums = np.zeros((2, self.num_classes, *label.shape), np.int32)
-            if self.sums.shape[2:] != label.shape:
-                self.is_one_size = False
-                return
-            counted = label < self.num_classes
-            for index, (both, either) in enumerate(zip(*self.sums, strict=True)):
-                labelled, predicted = label == index, (prediction == index) & counted
-                both += labelled & predicted
-                either += labelled | predicted
+    counted = label < sums.shape[1]
+    for index, (both, either) in enumerate(zip(*sums, strict=True)):
+        labelled, predicted = label == index, (prediction == index) & counted
+        both += labelled & predicted
+        either += labelled | predicted

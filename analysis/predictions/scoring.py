@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any, Literal, get_args
 
 import cv2
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.commands import in_threads
-from analysis.predictions.maps import MapSum, PixelMaps
+from analysis.predictions.maps import PixelMaps, add_image
 from rgbt.checks import InputError
 from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, PredictionReader
 from rgbt.dataset import LabelledDataset
@@ -45,7 +46,6 @@ class ScoringOptions:
             label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
             where the ratio of height and width differs.
         name: of the method; "": the folder's name.
-        threads: that read and count; 0: one per core.
         absent: convention for absent classes of the data set, stored with the counts.
     """
 
@@ -54,7 +54,6 @@ class ScoringOptions:
     format: FormatOptions = FormatOptions()
     resize: Resize = "refuse"
     name: str = ""
-    threads: int = 0
     absent: Absent = "released"
 
 
@@ -85,7 +84,7 @@ class FolderScores:
             self.maps.save(folder / "maps.npz")
 
     def remarks(self) -> list[str]:
-        """Remarks about the folder that a reader of the numbers needs, one sentence each."""
+        """Say what a reader of the numbers needs to know about the folder, a sentence each."""
         remarks = []
         for sizes, number in Counter(self.resized.values()).items():
             remarks.append(
@@ -105,7 +104,7 @@ class FolderScores:
 def find(
     folder: Path, names: Sequence[str], affixes: Affixes
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """The predictions of images, in their order: files prefix + NAME + suffix + ".png".
+    """Find the predictions of images in their order: files prefix + NAME + suffix + ".png".
 
     Also the names of other PNG files, overlays apart. InputError: no such folder, or a file misses.
     """
@@ -113,7 +112,8 @@ def find(
         raise InputError(f"predictions: no such folder: {folder}")
     stems = {path.stem for path in folder.glob("*.png")}
     own = [affixes.file_stem(name) for name in names]
-    if absent := [f"{stem}.png" for stem in own if stem not in stems]:
+    absent = [f"{stem}.png" for stem in own if stem not in stems]
+    if absent:
         held = _listed(sorted(path.name for path in folder.iterdir())) or "nothing"
         raise InputError(
             f"predictions: {folder} lacks {len(absent)} of the {len(names)} images of the split "
@@ -133,7 +133,7 @@ def score_folder(
     """Count predicted label images of any method against the labels of a split.
 
     The same files give the same counts whatever the number of threads. Memory: the counts, the
-    pixel maps (10 K H W bytes) and one image per thread.
+    pixel maps (8 K H W bytes) and one image per thread.
 
     Args:
         folder: holds NAME.png for every image of the split; other files are not read.
@@ -149,39 +149,39 @@ def score_folder(
     names = dataset.names(split)
     paths, extra = find(folder, names, options.format.affixes)
     reader = PredictionReader(dataset.classes, dataset.palette, options.format)
-    maps = MapSum(dataset.num_classes)
     partitions = [_regions(partition, options.regions) for partition in options.partitions]
+    size = _label_of(dataset, names[0]).shape
+    sums, lock = np.zeros((2, dataset.num_classes, *size), np.int32), Lock()
 
-    def count(image: str, path: Path) -> tuple[NDArray[np.int64], str]:
-        """Counts (partitions, R, K, K), and both sizes if it was resized."""
-        label = dataset.label(image)
-        if label is None:
-            raise InputError(f"split: '{image}' of {dataset.name} has no label to count against.")
-        prediction, sizes = reader.read(path), ""
+    def count(image: str, path: Path) -> tuple[NDArray[np.int64], bool, str]:
+        """Return counts (partitions, R, K, K), whether it is in the maps, and both sizes."""
+        label, prediction, sizes = _label_of(dataset, image), reader.read(path), ""
         if prediction.shape != label.shape:
             sizes = f"{_size(prediction)} to {_size(label)}"
             prediction = _resized(prediction, label, path, options.resize)
-        maps.add(label, prediction)
-        by_partition = [
-            region_counts(label, prediction, dataset.num_classes, regions) for regions in partitions
-        ]
-        return np.stack(by_partition), sizes
+        if label.shape == size:
+            with lock:
+                add_image(sums, label, prediction)
+        matrices = []
+        for regions in partitions:
+            matrices.append(region_counts(label, prediction, dataset.num_classes, regions))
+        return np.stack(matrices), label.shape == size, sizes
 
     shape = (len(partitions), len(names), options.regions, *[dataset.num_classes] * 2)
-    counts, resized = np.zeros(shape, np.int32), {}
-    every = in_threads(count, names, paths, threads=options.threads)
-    for index, (matrices, sizes) in enumerate(every):
+    counts, resized, is_one_size = np.zeros(shape, np.int32), {}, True
+    for index, (matrices, is_alike, sizes) in enumerate(in_threads(count, names, paths)):
         counts[:, index] = matrices
+        is_one_size &= is_alike
         if sizes:
             resized[names[index]] = sizes
         advance()
     name = options.name or folder.resolve().name
     shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
     of: dict[str, Any] = {"split": split, "dataset": dataset.fingerprint()}
-    summed = None
-    if maps.sums is not None and maps.is_one_size:
+    maps = None
+    if is_one_size:
         about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
-        summed = PixelMaps(intersection=maps.sums[0], union=maps.sums[1], **about, **of, **shared)
+        maps = PixelMaps(intersection=sums[0], union=sums[1], **about, **of, **shared)
     # Whatever a method gets to see, the images are those of both cameras.
     of |= {"absent": options.absent, "view": "rgbt", "dataset_name": dataset.name}
     shared |= {"names": names, "night": dataset.nights(names)}
@@ -189,7 +189,14 @@ def score_folder(
     for by_image, regions in zip(counts, partitions, strict=True):
         measurement = Measurement(partition=regions.name, **of)
         made.append(Counts(counts=by_image, measurement=measurement, **shared))
-    return FolderScores(name, tuple(made), summed, extra, resized)
+    return FolderScores(name, tuple(made), maps, extra, resized)
+
+
+def _label_of(dataset: LabelledDataset, image: str) -> Array:
+    label = dataset.label(image)
+    if label is None:
+        raise InputError(f"split: '{image}' of {dataset.name} has no label to count against.")
+    return label
 
 
 def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:
@@ -216,6 +223,6 @@ def _regions(partition: Partition, regions: int) -> Regions:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The first names of many, for a sentence."""
+    """List the first names of many, for a sentence."""
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more

@@ -1,5 +1,5 @@
 """Statistics of a data set by region: occupancy, Laplacian variance, signal to noise, entropy.
 
 Source: SpatialSeg, Sec. III-B and III-C. An image is measured by `measure`, a split by `collect`;
-`sample` derives the quantities, `statements` judges what the paper says about them.
+`resampled` derives the quantities, `statements` judges what the paper says about them.
 """

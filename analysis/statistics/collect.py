@@ -1,7 +1,7 @@
 """Statistics of a split by region: what is measured once, and the file that holds it.
 
 Letters: ``N`` images, ``R`` regions, ``K`` classes, ``H W`` pixels; the second axis of length 2 is
-the modality (`MODALITIES`). What is computed from them is in `sample`.
+the modality (`MODALITIES`). What is computed from them is in `resampled`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.commands import in_threads
-from analysis.statistics.measure import KERNELS, ImageMeasurements, ImageMeter
+from analysis.statistics.measure import KERNELS, ImageMeter
 from rgbt.checks import InputError, check_choice
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.archive import Archive
@@ -90,12 +90,12 @@ class SpatialStatistics:
         return tuple(np.flatnonzero(~self.is_background).tolist())
 
     def subsets(self) -> tuple[str, ...]:
-        """Parts of the images: ("all", "day", "night"), or ("all",) without images of both."""
+        """List the parts of the images: "all", and "day" and "night" if there are both."""
         both = self.night is not None and 0 < int(self.night.sum()) < len(self.names)
         return (ALL, DAY, NIGHT) if both else (ALL,)
 
     def chosen(self, part: str) -> NDArray[np.bool_]:
-        """(N,): which images belong to `part`: "all", "day" or "night".
+        """Return (N,): which images belong to `part`: "all", "day" or "night".
 
         Raises:
             InputError: no such part, a data set without that information, or no such image.
@@ -110,18 +110,19 @@ class SpatialStatistics:
         return wanted
 
     def occupied_in(self, part: str) -> NDArray[np.int64]:
-        """(K, H, W), images of `part` that have class k at the pixel; see `chosen`."""
+        """Count the images of `part` that have class k at the pixel, (K, H, W); see `chosen`."""
         self.chosen(part)
         by_part = self.occupied if part == ALL else self.occupied[[int(part == NIGHT)]]
         return np.asarray(by_part.sum(0))
 
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
-        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        values: dict[str, Any] = {}
+        for name in (field.name for field in fields(self)):
+            value = getattr(self, name)
+            values[name] = value if isinstance(value, np.ndarray) else np.array(value, str)
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.zeros(0, bool) if self.night is None else self.night
-        for key, each in values.items():
-            values[key] = each if isinstance(each, np.ndarray) else np.array(each, str)
         ARCHIVE.save(path, values)
 
     @classmethod
@@ -132,33 +133,19 @@ class SpatialStatistics:
     @classmethod
     def _of_arrays(cls, values: dict[str, Any]) -> SpatialStatistics:
         night = values.pop("night")
-        for key, each in values.items():
-            if each.dtype.kind == "U":
-                values[key] = tuple(each.tolist()) if each.ndim else str(each)
+        for key, array in values.items():
+            if array.dtype.kind == "U":
+                values[key] = tuple(array.tolist()) if array.ndim else str(array)
         return cls(night=night if len(night) else None, **values)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeasurementSettings:
-    """How a split is measured.
-
-    Attributes:
-        kernel: of the Laplacian, one of `KERNELS`.
-        short_edge: images are resized so that their shorter edge has so many pixels, the images by
-            area and the labels to the nearest pixel; 0: as they are.
-        workers: threads; 0: one per core.
-    """
-
-    regions: Regions
-    kernel: str = KERNELS[0]
-    short_edge: int = 0
-    workers: int = 0
 
 
 def collect(
     dataset: LabelledDataset,
     split: str,
-    settings: MeasurementSettings,
+    regions: Regions,
+    *,
+    kernel: str = KERNELS[0],
+    short_edge: int = 0,
     advance: Callable[[], object] = lambda: None,
 ) -> SpatialStatistics:
     """Read and measure every image of a split once.
@@ -166,11 +153,14 @@ def collect(
     Args:
         dataset: reads labelled pairs, all of one size.
         split: of the data set.
-        settings: see `MeasurementSettings`.
+        regions: partition of the image.
+        kernel: of the Laplacian, one of `KERNELS`.
+        short_edge: images are resized so that their shorter edge has so many pixels, the images by
+            area and the labels to the nearest pixel; 0: as they are.
         advance: called once per image.
 
     Returns:
-        the statistics, images in the order of the split.
+        the statistics, images in the order of the split; the same for any number of threads.
 
     Raises:
         InputError: no such split; a file that cannot be read; an image without label or of another
@@ -178,65 +168,61 @@ def collect(
     """
     names = dataset.names(split)
     nights = dataset.nights(names)
-
-    def read(name: str) -> Sample:
-        return _resized(dataset.read(name), settings.short_edge)
-
-    like = read(names[0])
-    region_map = settings.regions.map((like.rgb.shape[0], like.rgb.shape[1]))
+    like = _resized(dataset.read(names[0]), short_edge)
+    region_map = regions.map((like.rgb.shape[0], like.rgb.shape[1]))
     occupied = np.zeros((2, len(dataset.classes), *region_map.shape), np.int32)
-    meter, lock = ImageMeter(region_map, len(dataset.classes), settings.kernel), Lock()
+    meter, lock = ImageMeter(region_map, len(dataset.classes), kernel), Lock()
 
-    def measure(name: str, night: bool) -> ImageMeasurements:
-        sample = read(name)
+    def measure(name: str, night: bool) -> dict[str, NDArray[Any]]:
+        sample = _resized(dataset.read(name), short_edge)
         _check(sample, like)
         measured = meter(sample)
         with lock:
-            for index in np.flatnonzero(measured.labels.any(0)):
+            for index in np.flatnonzero(measured["labels"].any(0)):
                 occupied[int(night), index] += sample.label == index
         advance()
         return measured
 
-    every = in_threads(measure, names, nights or [False] * len(names), threads=settings.workers)
-    rows = zip(*every, strict=True)
+    images = list(in_threads(measure, names, nights or [False] * len(names)))
     return SpatialStatistics(
         dataset=dataset.name,
         fingerprint=dataset.fingerprint(),
         split=split,
         classes=tuple(dataset.classes),
         background=tuple(dataset.background),
-        partition=settings.regions.name,
+        partition=regions.name,
         region_map=region_map,
-        kernel=settings.kernel,
+        kernel=kernel,
         names=tuple(names),
         night=None if nights is None else np.array(nights, bool),
         occupied=occupied,
-        **{key: np.stack(each) for key, each in zip(ImageMeasurements._fields, rows, strict=True)},
+        **{key: np.stack([measured[key] for measured in images]) for key in images[0]},
     )
 
 
 def _resized(sample: Sample, short_edge: int) -> Sample:
-    """A sample in the size in which it is measured."""
+    """Resize a sample to the size in which it is measured."""
     height, width = sample.thermal.shape[:2]
     if short_edge in (0, min(height, width)):
         return sample
     factor = short_edge / min(height, width)
     size = round(width * factor), round(height * factor)
-    rgb, thermal = (
-        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        for image in (sample.rgb, sample.thermal)
-    )
+    rgb, thermal = _by_area(sample.rgb, size), _by_area(sample.thermal, size)
     label = sample.label
     if label is not None:
         label = np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return replace(sample, rgb=rgb, thermal=thermal, label=label)
 
 
+def _by_area(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def _check(sample: Sample, like: Sample) -> None:
     if sample.label is None:
         raise InputError(f"split: '{sample.name}' has no label; the statistics need one per image.")
     if sample.thermal.shape != like.thermal.shape:
-        sizes = ["x".join(map(str, each.thermal.shape)) for each in (sample, like)]
+        sizes = ["x".join(map(str, image.shape)) for image in (sample.thermal, like.thermal)]
         raise InputError(
             f"split: '{sample.name}' is {sizes[0]} pixels but '{like.name}' is {sizes[1]}; regions "
             "need images of one size."

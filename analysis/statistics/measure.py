@@ -6,7 +6,7 @@ Everything is whole numbers until the last division, so that the order of sums d
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,38 +39,12 @@ SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32)
 # Median of ``|x|`` for a standard normal x.
 MEDIAN_OF_NORMAL = 0.6744897501960817
 
+# Number of values of |a - b - c + d| of four bytes, which is twice the Haar coefficient HH.
+HAAR_BINS = 2 * 255 + 1
+
 Image = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
-
-
-class RegionSums:
-    """Sums over every region of an image, read once and in order along the runs of one region.
-
-    Args:
-        region_map: (H, W) uint8, region index 0..R-1.
-    """
-
-    def __init__(self, region_map: Image) -> None:
-        flat = region_map.ravel()
-        self.begins = np.append(True, flat[1:] != flat[:-1])
-        self._starts = np.flatnonzero(self.begins)
-        self._owner = flat[self._starts]
-
-    def __call__(self, values: NDArray[np.int32]) -> Floats:
-        """(R,) sums of (H, W) values; whole, kept as float64."""
-        along = np.add.reduceat(values.ravel(), self._starts, dtype=np.int64)
-        return np.asarray(np.bincount(self._owner, weights=along), np.float64)
-
-
-class ImageMeasurements(NamedTuple):
-    """One image, without the first axis of `analysis.statistics.collect.SpatialStatistics`."""
-
-    labels: Ints
-    ignored: Ints
-    laplacian: Floats
-    mean: Floats
-    noise: Floats
 
 
 class ImageMeter:
@@ -90,7 +64,11 @@ class ImageMeter:
         self._map = region_map
         self._num_classes = num_classes
         self._kernel = kernel
-        self._sums = RegionSums(region_map)
+        # Runs of pixels of one region, in the order in which an image lies in memory.
+        flat = region_map.ravel()
+        self._begins = np.append(True, flat[1:] != flat[:-1])
+        self._starts = np.flatnonzero(self._begins)
+        self._owner = flat[self._starts]
         self.num_regions = int(region_map.max()) + 1
         self._pixels = np.bincount(region_map.ravel()).astype(np.float64)
         inner = np.zeros(region_map.shape, np.int32)
@@ -101,27 +79,37 @@ class ImageMeter:
         corners = region_map[0 : height - 1 : 2, 0 : width - 1 : 2]
         self._block_bins = corners.astype(np.intp) * HAAR_BINS
 
-    def __call__(self, sample: Sample) -> ImageMeasurements:
-        """The measurements of one labelled pair of the size of the region map."""
+    def __call__(self, sample: Sample) -> dict[str, NDArray[Any]]:
+        """Measure one labelled pair of the size of the region map.
+
+        Returns labels, ignored, laplacian, mean and noise: the arrays of
+        `analysis.statistics.collect.SpatialStatistics` without the axis of the images.
+        """
         assert sample.label is not None, "only labelled samples are measured"
         labels, ignored = self.count_labels(sample.label)
         grey = cv2.cvtColor(sample.rgb, cv2.COLOR_RGB2GRAY)
         by_image = [self.measure(np.asarray(grey, np.uint8)), self.measure(sample.thermal)]
         laplacian, mean, *noise = np.stack(by_image, axis=1)
-        return ImageMeasurements(labels, ignored, laplacian, mean, np.stack(noise))
+        return {
+            "labels": labels,
+            "ignored": ignored,
+            "laplacian": laplacian,
+            "mean": mean,
+            "noise": np.stack(noise),
+        }
 
     def measure(self, image: Image) -> Floats:
-        """(2 + E, R): Laplacian variance, mean, and noise by every estimator of `ESTIMATORS`."""
+        """Return (2 + E, R): Laplacian variance, mean, and noise by all of `ESTIMATORS`."""
         _, laplacian = self._mean_and_variance(self._laplacian(image))
         mean, variance = self._mean_and_variance(image)
         noise = self._immerkaer(image), self._wavelet_mad(image), np.sqrt(variance)
         return np.stack([laplacian, mean, *noise])
 
     def count_labels(self, label: Image) -> tuple[Ints, Ints]:
-        """Pixels by region and class, (R, K), and ignored ones, (R,)."""
+        """Count pixels by region and class, (R, K), and ignored ones, (R,)."""
         flat = label.ravel()
         # Labels are large areas: a few thousand runs of one region and class instead of pixels.
-        begins = self._sums.begins.copy()
+        begins = self._begins.copy()
         begins[1:] |= flat[1:] != flat[:-1]
         starts = np.flatnonzero(begins)
         lengths = np.diff(starts, append=flat.size)
@@ -133,8 +121,13 @@ class ImageMeter:
         table = counts.astype(np.int64).reshape(self.num_regions, known + 1)
         return table[:, :known], table[:, known]
 
+    def _sums(self, values: NDArray[np.int32]) -> Floats:
+        """Add (H, W) values up to (R,) sums; whole, kept as float64."""
+        along = np.add.reduceat(values.ravel(), self._starts, dtype=np.int64)
+        return np.asarray(np.bincount(self._owner, weights=along), np.float64)
+
     def _laplacian(self, image: Image) -> NDArray[np.int16]:
-        """Signed whole numbers; the border is mirrored (OpenCV's default), so no pixel is lost."""
+        """Return whole numbers; the border is mirrored (OpenCV's default), so no pixel is lost."""
         if self._kernel == "four":
             return np.asarray(cv2.Laplacian(image, cv2.CV_16S, ksize=1), np.int16)
         return np.asarray(cv2.filter2D(image, cv2.CV_16S, EIGHT), np.int16)
@@ -167,12 +160,8 @@ class ImageMeter:
         return median / 2 / MEDIAN_OF_NORMAL
 
 
-# Number of values of |a - b - c + d| of four bytes, which is twice the Haar coefficient HH.
-HAAR_BINS = 2 * 255 + 1
-
-
 def grouped_median(histogram: NDArray[np.integer]) -> Floats:
-    """Median of rounded magnitudes, interpolated inside the bin that it falls into.
+    """Return the median of rounded magnitudes, interpolated inside the bin that it falls into.
 
     Bin 0 stands for [0, 0.5), bin k for [k - 0.5, k + 0.5). Without this, a median of whole numbers
     can be wrong by half a bin: for normal noise of one grey level the estimate would be 0.74. Even

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from analysis.statistics.collect import ALL, MODALITIES
 from analysis.statistics.measure import ESTIMATORS
-from analysis.statistics.sample import AVERAGES, Sample, Values, entropies, normalised
-from analysis.uncertainty.verdicts import FixedSeeds, decide
+from analysis.statistics.resampled import AVERAGES, ResampledSplit, Values, entropies, normalised
+from analysis.uncertainty.verdicts import Rule, decide
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -41,34 +41,18 @@ RANGES = {
 
 
 COLUMNS = [
-    "key",
-    "place",
-    "statement",
-    "estimator",
-    "average",
-    "verdict",
-    "contrast",
-    "value",
-    "low",
-    "high",
-    "wanted",
-    "finding",
-    "blocks",
+    *("key", "place", "statement", "estimator", "average", "verdict", "contrast"),
+    *("value", "low", "high", "wanted", "finding", "blocks"),
 ]
-# Contrasts that need rings, two of them or more.
+# Kinds of contrasts that need rings, two of them or more.
 NEEDS_CENTRE = (
-    "falls",
-    "central",
-    "central_except",
-    "even",
-    "centre_edge",
-    "centre_edge_by_part",
-    "centre_less_edge",
+    *("falls", "central", "central_except", "even", "centre_edge"),
+    *("centre_edge_by_part", "centre_less_edge"),
 )
 
 
-class Contrast(NamedTuple):
-    """One number of the images, (1 + B,) with its resamples.
+class StatedNumber(NamedTuple):
+    """One number of a statement, (1 + B,) with its resamples.
 
     Attributes:
         part: of the images that it comes from.
@@ -83,8 +67,8 @@ class Contrast(NamedTuple):
     limit: float = math.inf
 
 
-def judged(sample: Sample) -> pd.DataFrame:
-    """Every statement that the data can speak to, decided by `analysis.uncertainty.verdicts`.
+def judged(sample: ResampledSplit) -> pd.DataFrame:
+    """Decide every statement that the data can speak to by `analysis.uncertainty.verdicts`.
 
     Levels are those of single statements. Statements about noise appear once per estimator and
     average, those about sample occupancy only where a class is background.
@@ -104,34 +88,34 @@ def judged(sample: Sample) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def _decided(sample: Sample, stated: dict[str, Any]) -> Iterator[tuple[object, ...]]:
-    """Verdict of a statement, and each of its numbers with its own interval and verdict."""
+def _decided(sample: ResampledSplit, stated: dict[str, Any]) -> Iterator[tuple[object, ...]]:
+    """Yield the numbers of a statement, with its verdict and their own intervals and verdicts."""
     assert sample.settings is not None, "a verdict needs resamples"
-    wanted, rule = RANGES[stated["wanted"]], FixedSeeds(level=sample.settings.level)
-    found = [*_contrasts(sample, stated)]
-    evidences = [sample.evidence(each.values, each.part, each.present) for each in found]
+    wanted, rule = RANGES[stated["wanted"]], Rule(level=sample.settings.level)
+    found = [*_stated_numbers(sample, stated)]
+    evidences = [sample.evidence(number.values, number.part, number.present) for number in found]
     if not found:
         return
     whole = decide(evidences, wanted, rule, stated.get("combine", "all")).kind
-    for each, evidence in zip(found, evidences, strict=True):
+    for stated_number, evidence in zip(found, evidences, strict=True):
         alone = decide([evidence], wanted, rule, "all")
         half = alone.smallest  # NaN without an interval
         numbers = alone.estimate + np.array([0.0, -half, half])
-        numbers = np.clip(numbers, -each.limit, each.limit)
+        numbers = np.clip(numbers, -stated_number.limit, stated_number.limit)
         if stated["wanted"] not in ("> 0", "< 0"):
             numbers = np.exp(numbers)
         of_number = stated["wanted"], alone.kind, evidence.blocks
-        yield whole, each.what, *numbers.tolist(), *of_number
+        yield whole, stated_number.what, *numbers.tolist(), *of_number
 
 
 def thirds(values: Values) -> tuple[Values, Values]:
-    """Means of the inner and of the outer third of the last axis, at least one region each."""
+    """Average the inner and the outer third of the last axis, at least one region each."""
     third = max(1, values.shape[-1] // 3)
     return np.asarray(values[..., :third].mean(-1)), np.asarray(values[..., -third:].mean(-1))
 
 
-def _contrasts(sample: Sample, stated: dict[str, Any]) -> Iterator[Contrast]:
-    """The numbers of a statement; none where the regions or the images do not have them."""
+def _stated_numbers(sample: ResampledSplit, stated: dict[str, Any]) -> Iterator[StatedNumber]:
+    """Yield the numbers of a statement; none where the regions or the images lack them."""
     stats, kind, quantity = sample.stats, stated["contrast"], stated["quantity"]
     has_centre = stats.partition.startswith("ring") and stats.num_regions > 1
     is_known = stats.background or quantity != "occupancy"
@@ -144,45 +128,45 @@ def _contrasts(sample: Sample, stated: dict[str, Any]) -> Iterator[Contrast]:
     elif quantity == "entropy":
         for word, background in entropies(stats):
             centre, edge = thirds(sample.entropy(background=background))
-            yield Contrast(f"{word}: centre - edge, bits", centre - edge)
+            yield StatedNumber(f"{word}: centre - edge, bits", centre - edge)
     else:
         yield from _of_images(getattr(sample, quantity), stats.subsets(), stated)
 
 
-def _of_occupancy(sample: Sample, kind: str) -> Iterator[Contrast]:
+def _of_occupancy(sample: ResampledSplit, kind: str) -> Iterator[StatedNumber]:
     occupancy, middle = 100 * sample.occupancy(), sample.stats.num_regions // 2
     if kind == "falls":
         centre, edge = thirds(occupancy)
-        yield Contrast("centre - edge, points", centre - edge)
+        yield StatedNumber("centre - edge, points", centre - edge)
         for region, step in enumerate(-np.diff(occupancy).T, 1):
-            yield Contrast(f"region {region} - region {region + 1}, points", step)
+            yield StatedNumber(f"region {region} - region {region + 1}, points", step)
     elif sample.stats.partition.startswith("horizontal") and sample.stats.num_regions > 2:
         ends = (occupancy[:, 0] + occupancy[:, -1]) / 2
-        yield Contrast("middle - mean of the ends, points", occupancy[:, middle] - ends)
+        yield StatedNumber("middle - mean of the ends, points", occupancy[:, middle] - ends)
 
 
 def _of_images(
     by_region: Callable[[str], Values], parts: Sequence[str], stated: dict[str, Any]
-) -> Iterator[Contrast]:
-    """Quotients of (1 + B, 2, R) values of a part: of regions, modalities, or day and night."""
+) -> Iterator[StatedNumber]:
+    """Yield quotients of (1 + B, 2, R) values: of regions, modalities, or day and night."""
     kind, which = stated["contrast"], stated.get("modalities", MODALITIES)
     if kind in ("rgb_thermal", "thermal_rgb"):
         means, above = by_region(ALL).mean(-1), MODALITIES.index(kind.partition("_")[0])
-        yield Contrast(kind.replace("_", " / "), _log(means[:, above], means[:, 1 - above]))
+        yield StatedNumber(kind.replace("_", " / "), _log(means[:, above], means[:, 1 - above]))
     elif kind == "day_night" and len(parts) > 1:
         day, night = (by_region(part).mean(-1) for part in (DAY, NIGHT))
         for name in which:
             index = MODALITIES.index(name)
-            yield Contrast(f"{name}: day / night", _log(day[:, index], night[:, index]))
+            yield StatedNumber(f"{name}: day / night", _log(day[:, index], night[:, index]))
     elif kind != "day_night":
         apart = parts[1:] if kind == "centre_edge_by_part" else ()
         for name, part in product(which, apart or (ALL,)):
             centre, edge = thirds(by_region(part)[:, MODALITIES.index(name)])
-            yield Contrast(f"{name}, {part}: centre / edge", _log(centre, edge), part)
+            yield StatedNumber(f"{name}, {part}: centre / edge", _log(centre, edge), part)
 
 
-def _of_classes(sample: Sample, kind: str) -> Iterator[Contrast]:
-    """Where the samples of each class lie: 1 central, 0 even, -1 outside; how even one class is.
+def _of_classes(sample: ResampledSplit, kind: str) -> Iterator[StatedNumber]:
+    """Yield where each class lies (1 central, 0 even, -1 outside), or how even one class is.
 
     Evenness: mean over regions of the occupancy as Fig. 3 normalises it, 1 where all are equal.
     """
@@ -194,14 +178,14 @@ def _of_classes(sample: Sample, kind: str) -> Iterator[Contrast]:
         evenness = normalised(occupancy).mean(-1)
         above = evenness[:, own] - evenness[:, others].mean(-1)
         what = f"evenness of {EVEN} - mean evenness of the others"
-        yield Contrast(what, above, present=present[:, own])
+        yield StatedNumber(what, above, present=present[:, own])
     for name, k in occurs.items() if kind != "even" else ():
         if (name == EXCEPT) == (kind == "central_except"):
             centre, edge = thirds(occupancy[:, k])
             with np.errstate(invalid="ignore"):
                 share = (centre - edge) / (centre + edge)
             what = f"{name}: (centre - edge) / (centre + edge)"
-            yield Contrast(what, share, present=present[:, k], limit=1.0)
+            yield StatedNumber(what, share, present=present[:, k], limit=1.0)
 
 
 def _log(above: Values, below: Values) -> Values:

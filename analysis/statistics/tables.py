@@ -21,7 +21,7 @@ CLASS_QUANTITIES = {
 
 
 def heading(stats: SpatialStatistics) -> str:
-    """What was measured, in a line."""
+    """Say what was measured, in a line."""
     hw = stats.region_map.shape
     nights = "" if stats.night is None else f" ({int(stats.night.sum())} at night)"
     ignored = float(stats.ignored.sum() / max(1, stats.ignored.sum() + stats.labels.sum()))
@@ -34,7 +34,7 @@ def heading(stats: SpatialStatistics) -> str:
 def region_tables(
     frame: pd.DataFrame, stats: SpatialStatistics, way: tuple[str, str] | None = None
 ) -> list[TextTable]:
-    """The quantities by region, a table each; of noise by one `way` to estimate it, or by all."""
+    """Make a table of each quantity by region; of noise by one `way` to estimate it, or by all."""
     titles = {
         "occupancy": "sample occupancy rate, % (Eq. 2)",
         **CLASS_QUANTITIES,
@@ -59,24 +59,24 @@ def region_tables(
     tables = []
     for name, title in titles.items():
         of_quantity = rows[rows["quantity"] == name].groupby(["estimator", "average"], sort=False)
-        for each, chosen in of_quantity:
-            if way is None or all(one in ("", other) for one, other in zip(each, way, strict=True)):
-                wide = chosen.set_index(["label", "region"])["value"].unstack(sort=False)
-                wide = wide.assign(mean=wide.mean(axis=1, skipna=False))
-                wide = wide if len(wide.columns) <= WIDEST + 1 else wide.T
-                tables.append(text_table(title.format(*each), wide.rename_axis("")))
+        for of_noise, chosen in of_quantity:
+            if way is not None and of_noise not in (("", ""), (way[0], ""), way):
+                continue
+            wide = chosen.set_index(["label", "region"])["value"].unstack(sort=False)
+            wide = wide.assign(mean=wide.mean(axis=1, skipna=False))
+            wide = wide if len(wide.columns) <= WIDEST + 1 else wide.T
+            tables.append(text_table(title.format(*of_noise), wide.rename_axis("")))
     return tables
 
 
 def statement_table(frame: pd.DataFrame, level: float) -> TextTable:
-    """A line per number of `analysis.statistics.statements.judged`, below its statement."""
+    """Show each number of `analysis.statistics.statements.judged` below its statement."""
     repeated = frame.duplicated(["key", "estimator", "average"])
     way = (", " + frame["estimator"] + ", " + frame["average"]).where(frame["estimator"] != "", "")
+    statements = frame["statement"] + way + " (" + frame["place"] + ")"
     shown = pd.DataFrame(
         {
-            "statement": (frame["statement"] + way + " (" + frame["place"] + ")").mask(
-                repeated, ""
-            ),
+            "statement": statements.mask(repeated, ""),
             "verdict": frame["verdict"].mask(repeated, ""),
             "number": frame["contrast"],
             "value": frame["value"].map(digits),
@@ -90,7 +90,7 @@ def statement_table(frame: pd.DataFrame, level: float) -> TextTable:
 
 
 def estimator_table(frame: pd.DataFrame) -> TextTable:
-    """How the numbers about noise depend on its estimator and on the average."""
+    """Show how the numbers about noise depend on its estimator and on the average."""
     rows = frame[frame["estimator"] != ""]
     rows = rows.assign(
         way=rows["estimator"] + ", " + rows["average"],
@@ -102,7 +102,7 @@ def estimator_table(frame: pd.DataFrame) -> TextTable:
 
 
 def digits(value: float) -> str:
-    """Three decimals, or two of what is larger than 10."""
+    """Write three decimals, or two of what is larger than 10."""
     if math.isnan(value):
         return ABSENT
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.2f}"

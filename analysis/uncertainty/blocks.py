@@ -97,13 +97,16 @@ class ImageBlocks:
         return sum(self.sizes)
 
     def summed(self, values: NDArray[np.number]) -> Values:
-        """(N, ...) values of images -> (B, ...) sums inside blocks; whole numbers are exact."""
+        """Add (N, ...) values of images up to (B, ...) sums of blocks; whole numbers are exact."""
         order = np.argsort(self.index, kind="stable")
         starts = np.searchsorted(self.index[order], np.arange(self.count))
         return np.add.reduceat(values[order].astype(np.float64, copy=False), starts)
 
     def draws(self, settings: Resampling) -> Iterator[Values]:
-        """How often each resample draws each block, (chunk, B); each stratum keeps its number."""
+        """Yield how often each resample draws each block, (chunk, B), for some resamples at once.
+
+        Each stratum keeps its number of blocks.
+        """
         given = self.sizes, settings.resamples, settings.seed
         is_small = self.count * settings.resamples <= KEPT
         return iter(_kept_draws(*given)) if is_small else _draws(*given)
@@ -128,7 +131,7 @@ def make_blocks(
     series: Values | None = None,
     strata: ArrayLike | None = None,
 ) -> ImageBlocks:
-    """The blocks of N images, of whose names those of one sequence differ in one number alone.
+    """Make the blocks of N images; names of one sequence differ in one number alone.
 
     `choice` is that of `Resampling.blocks`. "auto" alone reads `series`, (L, N), the influence of
     every image on each of L scores, and takes the longest of their block lengths. No block holds
@@ -168,7 +171,7 @@ def make_blocks(
 
 
 def block_length(series: Values, sequences: Sequence[Places]) -> int:
-    """Neighbours to draw together, so that resampling sees their correlation.
+    """Return how many neighbours to draw together, so that resampling sees their correlation.
 
         b = (2 G^2 / D)^(1/3) n^(1/3),  G = sum |k| w(k) R(k),  D = 4/3 (sum w(k) R(k))^2
 
@@ -188,11 +191,15 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
     covered = math.ceil(math.sqrt(count)) + 5
 
     def autocovariance(lag: int) -> float:
-        """The sum over pairs `lag` frames apart in one sequence, over the number of all images."""
-        long = [centred[each] for each in sequences if len(each) > lag]
-        return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
+        """Divide the sum over pairs `lag` frames apart in one sequence by the number of images."""
+        total = 0.0
+        for places in sequences:
+            if len(places) > lag:
+                along = centred[places]
+                total += along[: len(along) - lag] @ along[lag:]
+        return float(total) / count
 
-    lags = np.array([*map(autocovariance, range(covered + 1))])
+    lags = np.array([autocovariance(lag) for lag in range(covered + 1)])
     above = lags[1:] > BAND / math.sqrt(count) * lags[0]
     last = len(above) if above.all() else int(np.argmin(above))
     if lags[0] <= 0 or last == 0:
@@ -210,7 +217,7 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
 def _automatic(
     sequences: Sequence[tuple[Values, Places]], series: Values
 ) -> tuple[list[Places], str, str]:
-    """Runs of consecutive frames, or pieces ([]: single images), their sizes, and the reason."""
+    """Find runs of consecutive frames, or pieces ([]: single images), their sizes, the reason."""
     runs: list[Places] = []
     for frames, places in sequences:
         steps = np.diff(frames)
@@ -226,7 +233,7 @@ def _automatic(
     levelled = series.copy()
     for _, places in sequences:
         levelled[:, places] -= levelled[:, places].mean(1, keepdims=True)
-    length = max((block_length(each, runs) for each in levelled), default=1)
+    length = max((block_length(scores, runs) for scores in levelled), default=1)
     while length > 1 and len(_cut(runs, length)) < FEWEST:
         length -= 1
     reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
@@ -238,13 +245,13 @@ def _automatic(
 
 
 def _range(pieces: Sequence[Places]) -> str:
-    """Sizes of the pieces, for example "2 to 20", or "10" where all are equal."""
+    """Say the sizes of the pieces, for example "2 to 20", or "10" where all are equal."""
     least, most = min(map(len, pieces)), max(map(len, pieces))
     return str(most) if least == most else f"{least} to {most}"
 
 
 def _sequences(names: Sequence[str], parts: Places) -> list[tuple[Values, Places]]:
-    """The frames of every sequence, numbers and places in their order; [] where names tell none.
+    """Find the frames of every sequence, numbers and places in their order; [] if there is none.
 
     The frame is the last number in the names that is not the same in all of them; names that are
     equal but for it, and lie in one stratum, are one sequence.
@@ -265,18 +272,23 @@ def _sequences(names: Sequence[str], parts: Places) -> list[tuple[Values, Places
             found.setdefault(rest, []).append((int(words[place][frame]), place))
     if all(len(frames) == 1 for frames in found.values()):
         return []
-    ordered = (np.array(sorted(frames)).T for frames in found.values())
-    return [(frames.astype(np.float64), places) for frames, places in ordered]
+    sequences = []
+    for frames in found.values():
+        numbers_in_order, places_in_order = np.array(sorted(frames)).T
+        sequences.append((numbers_in_order.astype(np.float64), places_in_order))
+    return sequences
 
 
 def _cut(sequences: Sequence[Places], length: int) -> list[Places]:
-    """Sequences cut into pieces of nearly equal size, at most `length` each."""
-    cut = (np.array_split(each, math.ceil(len(each) / length)) for each in sequences)
-    return [piece for pieces in cut for piece in pieces]
+    """Cut sequences into pieces of nearly equal size, at most `length`."""
+    pieces: list[Places] = []
+    for places in sequences:
+        pieces += np.array_split(places, math.ceil(len(places) / length))
+    return pieces
 
 
 def _joined(pieces: Sequence[Places], parts: Places, said: str, reason: str = "") -> ImageBlocks:
-    """Pieces as blocks, stratum by stratum."""
+    """Number the pieces as blocks, stratum by stratum."""
     ordered = sorted(pieces, key=lambda piece: parts[piece[0]])
     index = np.empty(len(parts), np.int64)
     for number, piece in enumerate(ordered):

@@ -88,12 +88,12 @@ class Evidence:
 
 
 def combine(weights: Sequence[float], parts: Sequence[Evidence]) -> Evidence:
-    """The evidence about a weighted sum of contrasts with the same seeds and draws of images."""
+    """Return the evidence about a weighted sum of contrasts with the same seeds and draws."""
     first = parts[0]
-    if any((each.seeds, each.blocks) != (first.seeds, first.blocks) for each in parts):
+    if any((part.seeds, part.blocks) != (first.seeds, first.blocks) for part in parts):
         raise ValueError("combine: expected the same seeds and images in all parts.")
-    of_seeds = np.array(weights) @ np.array([each.values for each in parts])
-    drawn = np.array(weights) @ np.array([each.drawn for each in parts])
+    of_seeds = np.array(weights) @ np.array([part.values for part in parts])
+    drawn = np.array(weights) @ np.array([part.drawn for part in parts])
     spread = over_images(drawn, first.blocks)
     return replace(
         first,
@@ -122,7 +122,7 @@ class Resampler:
         self._influences: dict[tuple[str, Absent], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
-        """The same as `contrast`, with an InputError where a run has nothing to score."""
+        """Do the same as `contrast`, with an InputError where a run has nothing to score."""
         found = self.contrast(terms, paired=paired)
         if np.isnan(found.values).any():
             keys = ", ".join(dict.fromkeys(key for term in terms for key in term.keys.values()))
@@ -133,7 +133,7 @@ class Resampler:
         return found
 
     def contrast(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
-        """What the data say about the sum of `terms`, each times its weight; NaN: nothing to score.
+        """Return what the data say about the weighted sum of `terms`; NaN: nothing to score.
 
         Fixed terms are paired with every seed of the others. For a mean of contrasts, pass the
         terms of all of them with their weights divided by the number of contrasts.
@@ -152,17 +152,16 @@ class Resampler:
         runs = [self._runs(terms[0], term, seeds) for term in terms]
         first = next(iter(runs[0].values()))
         blocks = make_blocks(first.names, self._settings.blocks, self._series(terms, runs, absent))
-        held = [
-            images_of(parse(term.metric), next(iter(each.values()))).names
-            for term, each in zip(terms, runs, strict=True)
-        ]
-        used = min(len(np.unique(blocks.index[np.isin(first.names, each)])) for each in held)
+        used = blocks.count
+        for term, of_term in zip(terms, runs, strict=True):
+            held = images_of(parse(term.metric), next(iter(of_term.values()))).names
+            used = min(used, len(np.unique(blocks.index[np.isin(first.names, held)])))
         parts, drawn = [], np.zeros(self._settings.resamples if used >= FEWEST else 0)
-        for term, each in zip(terms, runs, strict=True):
-            points = [value(term.metric, counts, absent) for counts in each.values()]
+        for term, of_term in zip(terms, runs, strict=True):
+            points = [value(term.metric, counts, absent) for counts in of_term.values()]
             parts.append(term.weight * np.array(points))
             if len(drawn):
-                scores = self._drawn(term.metric, each, blocks, absent)
+                scores = self._drawn(term.metric, of_term, blocks, absent)
                 drawn += term.weight * np.mean(scores, axis=0)
         means = np.broadcast_arrays(*parts) if paired else [part.mean() for part in parts]
         of_seeds = np.sum(means, axis=0)
@@ -179,8 +178,8 @@ class Resampler:
         )
 
     def _runs(self, reference: Term, term: Term, seeds: Sequence[int]) -> dict[str, Counts]:
-        """The counts of the used seeds by key, images in the order of their names."""
-        firsts = [each for each in seeds if each in reference.counts] or sorted(reference.counts)
+        """Return the counts of the used seeds by key, images in the order of their names."""
+        firsts = [seed for seed in seeds if seed in reference.counts] or sorted(reference.counts)
         name, found = reference.keys[firsts[0]], {}
         for seed in seeds if seeds and not term.fixed else sorted(term.counts):
             key = term.keys[seed]
@@ -193,36 +192,38 @@ class Resampler:
     def _series(
         self, terms: Sequence[Term], runs: Sequence[Mapping[str, Counts]], absent: Absent
     ) -> Values | None:
-        """(L, N) influence of every image on each term and on the contrast, for "auto" blocks."""
+        """Return the influence (L, N) of images on terms and contrast, for "auto" blocks."""
         if self._settings.blocks != "auto":
             return None
-        every = [
-            np.mean([self._influence(key, counts, absent) for key, counts in each.items()], axis=0)
-            for each in runs
-        ]
-        kinds = {watched(counts) for each in runs for counts in each.values()}
+        of_terms, weighted, kinds = [], [], set()
+        for term, of_term in zip(terms, runs, strict=True):
+            influences = []
+            for key, counts in of_term.items():
+                influences.append(self._influence(key, counts, absent))
+                kinds.add(watched(counts))
+            of_terms.append(np.mean(influences, axis=0))
+            weighted.append(term.weight * of_terms[-1])
         if len(terms) > 1 and len(kinds) == 1:
-            weighted = [term.weight * each for term, each in zip(terms, every, strict=True)]
-            every.append(np.sum(weighted, axis=0))
-        return np.asarray(np.nan_to_num(np.concatenate(every)), np.float64)
+            of_terms.append(np.sum(weighted, axis=0))
+        return np.asarray(np.nan_to_num(np.concatenate(of_terms)), np.float64)
 
     def _influence(self, key: str, counts: Counts, absent: Absent) -> Values:
-        """(L, N) the `watched` scores without each image."""
+        """Return the `watched` scores (L, N) of all images but one."""
         if (key, absent) not in self._influences:
-            every = counts.counts.astype(np.float64)
-            without = every.sum(0) - every
-            series = [values(each, without, counts, absent) for each in watched(counts)]
+            by_image = counts.counts.astype(np.float64)
+            without = by_image.sum(0) - by_image
+            series = [values(metric, without, counts, absent) for metric in watched(counts)]
             self._influences[key, absent] = np.stack(series)
         return self._influences[key, absent]
 
     def _drawn(
         self, metric: str, runs: Mapping[str, Counts], blocks: ImageBlocks, absent: Absent
     ) -> list[Values]:
-        """(resamples,) scores of each run with `blocks` drawn anew; NaN: nothing to score."""
-        place = metric, absent, blocks.index.tobytes()
-        missing = {
-            key: counts for key, counts in runs.items() if (key, *place) not in self._resampled
-        }
+        """Return (resamples,) scores of each run with blocks drawn anew; NaN: nothing to score."""
+        place, missing = (metric, absent, blocks.index.tobytes()), {}
+        for key, counts in runs.items():
+            if (key, *place) not in self._resampled:
+                missing[key] = counts
         columns, scores = {}, {key: list[Values]() for key in missing}
         for key, counts in missing.items():
             array, parsed = _columns(parse(metric), counts)
@@ -236,7 +237,7 @@ class Resampler:
 
 
 def watched(like: Counts) -> tuple[ParsedMetric, ...]:
-    """Scores that tell how far neighbouring images are alike, whatever is requested: the main ones.
+    """Return the main scores, which tell how far neighbouring images are alike.
 
     Single frames have pixel accuracy too, which shows likeness most clearly.
     """
@@ -248,7 +249,7 @@ def watched(like: Counts) -> tuple[ParsedMetric, ...]:
 
 
 def _columns(metric: ParsedMetric, counts: Counts) -> tuple[NDArray[np.integer], ParsedMetric]:
-    """(N, ...) counts that the metric reads, and the metric of their sum.
+    """Return the counts (N, ...) that the metric reads, and the metric of their sum.
 
     Images of another part of the day are 0. Regions that are not read are summed or left out,
     because the draws are the slow part.
@@ -268,7 +269,7 @@ def _columns(metric: ParsedMetric, counts: Counts) -> tuple[NDArray[np.integer],
 
 
 def _common_seeds(terms: Sequence[Term]) -> tuple[int, ...]:
-    """Seeds that all terms with seeds have, ascending; () where all terms are fixed."""
+    """Return the seeds that all terms with seeds have, ascending; () where all are fixed."""
     trained = [set(term.counts) for term in terms if not term.fixed]
     shared = set.intersection(*trained) if trained else set()
     if trained and not shared:

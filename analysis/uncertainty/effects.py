@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -27,22 +27,10 @@ from analysis.uncertainty.intervals import Spread, holm
 Noise = Literal["cells", "effects"]
 
 
-@dataclass(frozen=True)
-class Effect:
-    """One effect: its estimate, and its p-value corrected for its family (Holm)."""
-
-    estimate: Estimate
-    corrected: float
-
-    def is_shown(self, level: float = 0.95) -> bool:
-        """Whether the effect differs from 0, corrected for the number of effects."""
-        return self.corrected < 1 - level
-
-
 def estimate_effects(
     cells: Sequence[Evidence], contrasts: Values, noise: Noise, level: float = 0.95
-) -> list[Effect]:
-    """Effects with intervals over seeds and images.
+) -> list[Estimate]:
+    """Estimate effects with intervals over seeds and images.
 
     Args:
         cells: evidence of an outcome in C cells, with the same seeds and draws of images.
@@ -52,7 +40,7 @@ def estimate_effects(
         level: of the intervals.
 
     Returns:
-        E effects, whose p-values are corrected for E.
+        E estimates, whose p-values are corrected for E (Holm).
 
     Raises:
         ValueError: contrasts of another number of cells, or unbalanced ones.
@@ -64,7 +52,7 @@ def estimate_effects(
     seeds = len(values)
     # Each seed is a block: initial weights and the order of the data are the same in all its cells.
     left = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
-    found = []
+    found: list[Estimate] = []
     for signs in contrasts:
         is_mean = bool((signs > 0).all())
         weights = signs / count if is_mean else 2.0 * signs / count
@@ -74,5 +62,5 @@ def estimate_effects(
             variance = float((left**2).sum()) / freedom * float((weights**2).sum()) / seeds
             evidence = replace(evidence, trainings=Spread(math.sqrt(variance), freedom))
         found.append(estimate_of(evidence, level))
-    ps = holm([math.nan if each.both is None else each.p for each in found])
-    return [Effect(each, p) for each, p in zip(found, ps, strict=True)]
+    ps = holm([math.nan if estimate.both is None else estimate.p for estimate in found])
+    return [replace(estimate, p_corrected=p) for estimate, p in zip(found, ps, strict=True)]

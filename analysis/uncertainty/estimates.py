@@ -38,6 +38,8 @@ class Estimate:
         trainings: interval over seeds, images as they are; None for one seed.
         both: interval over images and seeds; None where one of the two is.
         p: two-sided p-value of `interval` against 0; NaN without one.
+        p_corrected: the same, corrected for the number of estimates that are shown together (Holm);
+            NaN where it was not corrected.
     """
 
     value: float
@@ -48,15 +50,20 @@ class Estimate:
     both: Interval | None
     p: float
     evidence: Evidence
+    p_corrected: float = math.nan
 
     @property
     def interval(self) -> Interval | None:
         """The interval to go by: over images and seeds, else over images."""
         return self.both or self.images
 
+    def is_shown(self, level: float = 0.95) -> bool:
+        """Say whether it differs from 0, corrected for the number of estimates."""
+        return self.p_corrected < 1 - level
+
 
 def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
-    """Student's intervals of a contrast, or of a score called `metric`.
+    """Compute Student's intervals of a contrast, or of a score called `metric`.
 
     Variances over regions and calibration errors are never negative, and chance alone raises them
     and raises each resample again.
@@ -76,25 +83,28 @@ def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
         if around is not None and used is not None:
             used = images_and_seeds(used, evidence.trainings, level)
             both = student(value, used, level)
-    intervals = [around, over_seeds, both]
     if metric:  # no score is negative
-        intervals = [each and Interval(max(0.0, each.low), each.high) for each in intervals]
+        around, over_seeds, both = map(_not_negative, (around, over_seeds, both))
     return Estimate(
         value=value,
         sd=float(np.std(evidence.values, ddof=1)) if len(evidence.values) > 1 else math.nan,
         seeds=len(evidence.values),
-        images=intervals[0],
-        trainings=intervals[1],
-        both=intervals[2],
+        images=around,
+        trainings=over_seeds,
+        both=both,
         p=math.nan if around is None or used is None else student_p(value, used),
         evidence=evidence,
     )
 
 
+def _not_negative(interval: Interval | None) -> Interval | None:
+    return None if interval is None else Interval(max(0.0, interval.low), interval.high)
+
+
 def estimate(
     seeds: Sequence[Counts], metrics: Sequence[str], settings: Resampling
 ) -> dict[str, Estimate]:
-    """Scores of one method, of counts of one or more trainings on the same images.
+    """Estimate scores of one method, by counts of one or more trainings on the same images.
 
     Returns:
         metric (`rgbt.metrics.named`) -> estimate, in the requested order.
@@ -103,9 +113,11 @@ def estimate(
         InputError: no such metric, class or region; seeds on different images; blocks that cannot
             be made.
     """
-    engine = Resampler(settings, "pixels")
-    found = {metric: engine.contrast([_term(1.0, metric, seeds, "a")]) for metric in metrics}
-    return {metric: estimate_of(each, settings.level, metric) for metric, each in found.items()}
+    engine, found = Resampler(settings, "pixels"), {}
+    for metric in metrics:
+        evidence = engine.contrast([_term(1.0, metric, seeds, "a")])
+        found[metric] = estimate_of(evidence, settings.level, metric)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,15 +125,13 @@ class Difference:
     """Method b less method a in one score.
 
     Attributes:
-        difference: the estimate of ``b - a``.
-        p_corrected: its p-value, corrected for the number of scores compared (Holm).
+        difference: the estimate of ``b - a``, corrected for the number of scores compared.
     """
 
     metric: str
     a: Estimate
     b: Estimate
     difference: Estimate
-    p_corrected: float = math.nan
 
     @property
     def value(self) -> float:
@@ -159,10 +169,7 @@ class Comparison:
 
 
 def compare(
-    a: Sequence[Counts],
-    b: Sequence[Counts],
-    metrics: Sequence[str],
-    settings: Resampling,
+    a: Sequence[Counts], b: Sequence[Counts], metrics: Sequence[str], settings: Resampling
 ) -> Comparison:
     """Compare two methods on the same images.
 
@@ -178,17 +185,20 @@ def compare(
     for metric in dict.fromkeys(metrics):
         terms = [_term(-1.0, metric, a, "a"), _term(1.0, metric, b, "b")]
         difference = estimate_of(engine.contrast(terms, paired=False), settings.level)
-        sides = [
-            estimate_of(engine.contrast([replace(term, weight=1.0)]), settings.level, metric)
-            for term in terms
-        ]
+        sides = []
+        for term in terms:
+            evidence = engine.contrast([replace(term, weight=1.0)])
+            sides.append(estimate_of(evidence, settings.level, metric))
         found.append(Difference(metric=metric, a=sides[0], b=sides[1], difference=difference))
-    if all(each.difference.evidence.blocks < FEWEST for each in found):
+    if all(compared.difference.evidence.blocks < FEWEST for compared in found):
         said = found[0].difference.evidence.said
         raise InputError(f"{said} are too few to compare two methods; {FEWEST} are the least.")
-    ps = holm([each.difference.p for each in found])
+    ps = holm([compared.difference.p for compared in found])
+    for index, p in enumerate(ps):
+        estimated = replace(found[index].difference, p_corrected=p)
+        found[index] = replace(found[index], difference=estimated)
     return Comparison(
-        differences=tuple(replace(each, p_corrected=p) for each, p in zip(found, ps, strict=True)),
+        differences=tuple(found),
         images=len(images_of(parse(metrics[0]), a[0]).names),
         partition=a[0].partition,
         level=settings.level,
@@ -208,7 +218,7 @@ def _term(weight: float, metric: str, seeds: Sequence[Counts], side: str) -> Ter
 
 
 def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
-    """The first difference of a comparison as a sentence, with everything that limits it."""
+    """Say the first difference of a comparison, with everything that limits it."""
     found = comparison.differences[0]
     metric, difference, interval = found.metric, found.difference, found.interval
     if interval is None:
@@ -237,7 +247,7 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
         more = f"{abs(found.value):.2f}{unit} {'higher' if found.value > 0 else 'lower'}"
         said = f"{start}the {metric} of {label_b} is {more} than that of {label_a} {evidence}"
         count = len(comparison.differences)
-        corrected = f"corrected for all {count} scores compared, {_as_p(found.p_corrected)}"
+        corrected = f"corrected for all {count} scores compared, {_as_p(difference.p_corrected)}"
         end = f"; {corrected}" if count > 1 else ""
     else:
         said = f"{start}a difference in {metric} between {label_b} and {label_a} is not shown"

@@ -36,7 +36,7 @@ class Spread:
 
 
 def over_images(drawn: Values, *blocks: int) -> Spread | None:
-    """Standard error of a score over the draw of the images.
+    """Compute the standard error of a score over the draw of the images.
 
     Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error. The
     same holds for B blocks with images of the metric among more blocks: where all are drawn, the
@@ -54,19 +54,21 @@ def over_images(drawn: Values, *blocks: int) -> Spread | None:
 
 
 def over_seeds(*methods: Values) -> Spread | None:
-    """Standard error of the mean of (S,) scores over seeds, or of a sum of such means (Welch).
+    """Compute the standard error of a mean of (S,) scores over seeds, or of a sum of means (Welch).
 
     None where one of them has a single seed or a score is missing.
     """
-    if any(len(each) < 2 or np.isnan(each).any() for each in methods):
-        return None
-    return together(
-        *(Spread(float(each.std(ddof=1)) / math.sqrt(len(each)), len(each) - 1) for each in methods)
-    )
+    parts = []
+    for scores in methods:
+        count = len(scores)
+        if count < 2 or np.isnan(scores).any():
+            return None
+        parts.append(Spread(float(scores.std(ddof=1)) / math.sqrt(count), count - 1))
+    return together(*parts)
 
 
 def together(*parts: Spread) -> Spread:
-    """Independent sources of error added up; degrees of freedom of Welch and Satterthwaite."""
+    """Add up independent sources of error; degrees of freedom of Welch and Satterthwaite."""
     squares = sum(part.error**2 for part in parts)
     if squares == 0:
         return Spread(0.0, min(part.freedom for part in parts))
@@ -75,7 +77,7 @@ def together(*parts: Spread) -> Spread:
 
 
 def images_and_seeds(images: Spread, seeds: Spread, level: float) -> Spread:
-    """Both sources of error, but not narrower than the seeds alone.
+    """Add up both sources of error, but return no less than the seeds alone.
 
     With two or three seeds the sum of both may have so many more degrees of freedom that its
     interval is narrower than that of the seeds; it then covers too rarely.
@@ -85,7 +87,7 @@ def images_and_seeds(images: Spread, seeds: Spread, level: float) -> Spread:
 
 
 def student(value: float, spread: Spread, level: float) -> Interval:
-    """``value -+ t error``."""
+    """Return the interval ``value -+ t error``."""
     from scipy.special import stdtrit  # what `scipy.stats.t.ppf` calls, 50 times faster
 
     half = float(stdtrit(spread.freedom, (1 + level) / 2)) * spread.error
@@ -93,7 +95,7 @@ def student(value: float, spread: Spread, level: float) -> Interval:
 
 
 def student_p(value: float, spread: Spread) -> float:
-    """Two-sided p-value of `value` against 0."""
+    """Return the two-sided p-value of `value` against 0."""
     from scipy.stats import t
 
     if spread.error == 0:
@@ -102,7 +104,7 @@ def student_p(value: float, spread: Spread) -> float:
 
 
 def corrected(value: float, bias: float, spread: Spread, level: float) -> Interval:
-    """Student's interval of a score that is never negative, without the bias of its estimate.
+    """Return Student's interval of a score that is never negative, without its bias.
 
         value - bias -+ t error,  cut at 0,  and containing `value`
 
@@ -118,7 +120,7 @@ def corrected(value: float, bias: float, spread: Spread, level: float) -> Interv
 
 
 def of_gaps(value: float, drawn: Values, spread: Spread, level: float) -> Interval:
-    """Interval of a sum of absolute differences, such as a calibration error.
+    """Return the interval of a sum of absolute differences, such as a calibration error.
 
         from  value - (1 + sqrt 2) bias - t error,  cut at 0,  to a quantile of the resamples
 
@@ -135,7 +137,7 @@ def of_gaps(value: float, drawn: Values, spread: Spread, level: float) -> Interv
 
 
 def holm(ps: Sequence[float]) -> list[float]:
-    """P-values corrected for their number (family-wise error rate).
+    """Correct p-values for their number (family-wise error rate).
 
     Source: Holm, Scandinavian Journal of Statistics 6 (1979). NaN stays NaN and is not counted.
     """

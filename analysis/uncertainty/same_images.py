@@ -19,7 +19,7 @@ Alike = Literal["pixels", "labels", "names"]
 
 
 def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
-    """`other` with its images in the order of `first`.
+    """Return `other` with its images in the order of `first`.
 
     Raises:
         InputError: other images, classes, scored classes, labels or regions.
@@ -53,13 +53,14 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
 def _check_labels(first: Counts, same: Counts) -> None:
     """Compare the labelled pixels of every image, by region where both have the same regions."""
     if first.partition == same.partition:
-        labelled = [_labelled(each) for each in (first, same)]
-    elif [_kind(each) for each in (first, same)] == [None, None]:
-        labelled = [each.counts.sum((1, -1), dtype=np.int64) for each in (first, same)]
+        labelled, of_same = _labelled(first), _labelled(same)
+    elif _kind(first) is None and _kind(same) is None:
+        labelled = first.counts.sum((1, -1), dtype=np.int64)
+        of_same = same.counts.sum((1, -1), dtype=np.int64)
     else:
         return
-    labelled = [each.reshape(len(first.names), -1) for each in labelled]
-    unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
+    differs = (labelled != of_same).reshape(len(first.names), -1)
+    unequal = np.flatnonzero(differs.any(1))
     if len(unequal):
         raise InputError(
             f"'{first.names[unequal[0]]}' has different labels in the two counts "
@@ -68,22 +69,21 @@ def _check_labels(first: Counts, same: Counts) -> None:
 
 
 def _kind(counts: Counts) -> str | None:
-    """Protocol of pairs of frames or kind of details; None: confusion matrices of regions."""
+    """Return the protocol of pairs or the kind of details; None: confusion matrices of regions."""
     details = details_of(counts.partition)
     return protocol_of(counts.partition) if details is None else details.kind
 
 
 def _labelled(counts: Counts) -> NDArray[np.int64]:
-    """(N, ...) numbers of pixels that depend on the labels alone."""
+    """Return the numbers of pixels (N, ...) that depend on the labels alone."""
     array, kind = counts.counts, _kind(counts)
     if kind == "boundary":
         return array[:, :, LABEL].astype(np.int64)
     if kind == "calibration":
         # Bins and classes are those of the prediction; only their sum over a region is not.
         details = details_of(counts.partition)
-        number = (
-            array[:, :, NUMBER].sum(-1).reshape(len(array), -1, details.groups if details else 1)
-        )
+        groups = details.groups if details else 1
+        number = array[:, :, NUMBER].sum(-1).reshape(len(array), -1, groups)
         return np.asarray(number.sum(-1, dtype=np.int64))
     # Labels are rows; of pairs of frames a matrix each; of triples every index is a prediction.
     axes = {None: (-1,), "distance": (-1,), "size": (-1,), "triples": (-3, -2, -1)}

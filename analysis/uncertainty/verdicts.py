@@ -38,7 +38,7 @@ Covers = Literal["images and seeds", "images", "none"]
 # Largest number of seeds that is searched for `Verdict.seeds_needed`.
 MOST_SEEDS = 1000
 
-# Warning of a verdict on one common start; rates of `FixedSeeds` in simulations.
+# Warning of a verdict on one common start; rates of fixed seeds in simulations.
 ONE_START = (
     "All seeds began from one start, and the interval does not contain the spread between starts. "
     "If a start shifts a difference by two standard deviations of the seeds, 18 % of claims about "
@@ -54,7 +54,7 @@ PRECISION = 0.25
 
 
 def e_value(t: float, count: int, precision: float = PRECISION) -> float:
-    """Evidence of `count` values against the mean that `t` is measured from.
+    """Return the evidence of `count` values against the mean that `t` is measured from.
 
         e = sqrt(r) ((1 + x) / (1 + r x))^(n / 2),  x = t^2 / (n - 1),  r = c / (n + c)
 
@@ -70,10 +70,11 @@ def e_value(t: float, count: int, precision: float = PRECISION) -> float:
 
 
 def half_width(sd: float, count: int, alpha: float, precision: float = PRECISION) -> float:
-    """Half of the width of the interval after `count` values of standard deviation `sd` (n - 1).
+    """Return half of the width of the interval after `count` values.
 
-    The condition ``e_value < 1 / alpha`` solved for the tested mean; infinite with too few values.
-    `alpha`, 0..1, bounds the rate of sequences that ever miss the mean.
+    It is the condition ``e_value < 1 / alpha`` solved for the tested mean; infinite with too few
+    values. `sd`: their standard deviation (n - 1). `alpha`, 0..1, bounds the rate of sequences that
+    ever miss the mean.
     """
     if count < 2:
         return math.inf
@@ -86,43 +87,37 @@ def half_width(sd: float, count: int, alpha: float, precision: float = PRECISION
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixedSeeds:
-    """Rule for a number of seeds that was chosen before any result was known.
+class Rule:
+    """How the seeds were chosen, which decides how wide an interval is.
 
-    The interval of `level` is that of `analysis.uncertainty.compare` for paired trainings: Student
-    over images and seeds, never narrower than over seeds alone. Few seeds cannot show whether they
-    are normal: with 3 to 10 lognormal ones (sd 1 of the logarithm), 14 to 18 % of the verdicts
-    about no difference are wrong instead of 5 %.
+    Attributes:
+        any_time: False: the number of seeds was chosen before any result was known. The interval is
+            that of `analysis.uncertainty.compare` for paired trainings: Student over images and
+            seeds, never narrower than over seeds alone. Few seeds cannot show whether they are
+            normal: with 3 to 10 lognormal ones (sd 1 of the logarithm), 14 to 18 % of the verdicts
+            about no difference are wrong instead of 5 %.
+            True: seeds are added until the verdict is clear. Seeds: a confidence sequence, see
+            `half_width`. Images: Student's interval. Each has half of the error rate, and the
+            squares of their half widths add up. At a `level` of 95 % for all intervals together,
+            at most 4.8 % of simulated sequences ever missed the truth (2 to 3,000 seeds). With the
+            whole error rate for each it was up to 9.8 %.
+        level: confidence level of all intervals together.
     """
 
+    any_time: bool = False
     level: float = 0.95
 
     def half(self, trainings: Spread, images: Spread, level: float) -> float:
-        """Half of the width of the interval; degrees of freedom of `trainings`: n - 1."""
-        return student(0.0, images_and_seeds(images, trainings, level), level).half
+        """Return half of the width of an interval; degrees of freedom of `trainings`: n - 1.
 
-
-@dataclass(frozen=True, kw_only=True)
-class AnyTime:
-    """Rule for seeds that are added until the verdict is clear.
-
-    Seeds: a confidence sequence, see `half_width`. Images: Student's interval.
-    Each has half of the error rate, and the squares of their half widths add up. At a `level` of
-    95 % for all intervals together, at most 4.8 % of simulated sequences ever missed the truth (2
-    to 3,000 seeds). With the whole error rate for each it was up to 9.8 %.
-    """
-
-    level: float = 0.95
-
-    def half(self, trainings: Spread, images: Spread, level: float) -> float:
-        """The rule of `FixedSeeds`; infinite where seeds are too few for a confidence sequence."""
+        Infinite where seeds are too few for a confidence sequence.
+        """
+        if not self.any_time:
+            return student(0.0, images_and_seeds(images, trainings, level), level).half
         alpha = (1 - level) / 2
         count = round(trainings.freedom) + 1
         of_seeds = half_width(trainings.error * math.sqrt(count), count, alpha)
         return math.hypot(of_seeds, student(0.0, images, 1 - alpha).half)
-
-
-Rule = FixedSeeds | AnyTime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +157,7 @@ class Verdict:
 
 
 def similar(margin: float) -> tuple[float, float]:
-    """The range of "does as well as": it holds where the whole interval is inside the margin.
+    """Return the range of "does as well as": the whole interval must be inside the margin.
 
     Two one-sided tests, each with half of the error rate; that no difference was shown is no
     evidence for none. ValueError: the margin is no number above 0.
@@ -211,22 +206,31 @@ def decide(
     if not evidences or (combine == "mean" and len(evidences) > 1):
         expected = "one evidence, of the mean contrast" if combine == "mean" else "evidence"
         raise ValueError(f"{combine}: expected {expected}, got {len(evidences)}.")
-    count = len(evidences)
-    needed = {"all": count, "most": count // 2 + 1, "any": 1, "mean": 1}[combine]
-    claim = _Claim(evidences, wanted, rule, needed)
-    kind = claim.kind()
-    decisive = claim.decisive(kind)
-    shown, estimate = evidences[decisive], float(claim.estimates[decisive])
-    half, seeds = float(claim.halves(kind)[decisive]), len(shown.seeds)
+    needed = _needed(len(evidences), combine)
+    against = len(evidences) - needed + 1  # so many outside the range contradict the claim
+    kind = _kind(evidences, wanted, rule, needed)
+    level = _level(rule, needed if kind == "contradicted" else against)
+    # The contrast that is the last one to make the verdict, or the first one to prevent it.
+    standings = _standings(evidences, wanted, rule, level)
+    if kind == "contradicted":
+        standings = -standings
+    order = np.argsort(-standings, kind="stable")
+    decisive = int(order[(against if kind == "contradicted" else needed) - 1])
+    shown, estimate = evidences[decisive], float(np.mean(evidences[decisive].values))
+    half, seeds = _half_width(shown, rule, level), len(shown.seeds)
     if seeds == 1 and shown.images is not None:
-        half = student(0.0, shown.images, claim.level(kind)).half
-    known = math.isfinite(half)
-    seeds_needed = claim.seeds_needed() if kind == "undecided" else float(seeds)
+        half = student(0.0, shown.images, level).half
+    known, seeds_needed = math.isfinite(half), float(seeds)
+    if kind == "undecided":
+        seeds_needed = _seeds_needed(evidences, wanted, rule, needed)
+    covers: Covers = "none"
+    if known:
+        covers = "images and seeds" if seeds > 1 else "images"
     verdict = Verdict(
         kind=kind,
         estimate=estimate,
         interval=Interval(estimate - half, estimate + half) if known else None,
-        covers="none" if not known else "images and seeds" if seeds > 1 else "images",
+        covers=covers,
         smallest=half if known else math.nan,
         seeds=seeds,
         seeds_needed=seeds_needed,
@@ -239,76 +243,84 @@ def decide(
     return verdict
 
 
-class _Claim:
-    """Contrasts of which at least `needed` must be as claimed."""
+def _needed(count: int, combine: Combine) -> int:
+    """Return how many of `count` contrasts must be as claimed."""
+    return {"all": count, "most": count // 2 + 1, "any": 1, "mean": 1}[combine]
 
-    def __init__(
-        self,
-        evidences: Sequence[Evidence],
-        wanted: tuple[float, float],
-        rule: Rule,
-        needed: int,
-    ) -> None:
-        self.evidences, self.rule, self.needed = evidences, rule, needed
-        self.estimates = np.array([np.mean(each.values) for each in evidences])
-        self.margins = np.minimum(self.estimates - wanted[0], wanted[1] - self.estimates)
-        self.sds = [np.std(e.values, ddof=1) if len(e.values) > 1 else math.nan for e in evidences]
-        self.against = len(evidences) - needed + 1  # outside the range, they contradict the claim
 
-    def level(self, kind: Kind) -> float:
-        """Level of each interval; of an open claim that with which it would hold."""
-        others = self.needed if kind == "contradicted" else self.against
-        return 1.0 - (1.0 - self.rule.level) / others
+def _level(rule: Rule, others: int) -> float:
+    """Return the level of each interval where `others` of them share the error rate."""
+    return 1.0 - (1.0 - rule.level) / others
 
-    def halves(self, kind: Kind, seeds: int = 0) -> list[float]:
-        """Half widths of the intervals that give `kind`, with `seeds` seeds where they are more.
 
-        Infinite or NaN where there is no interval.
-        """
-        level, found = self.level(kind), []
-        for each, sd in zip(self.evidences, self.sds, strict=True):
-            count = max(len(each.seeds), seeds)
-            if each.images is None:
-                found.append(math.nan)
-            elif not each.seeds:  # all terms are fixed
-                found.append(student(0.0, each.images, level).half)
-            elif math.isnan(sd):
-                found.append(math.inf)
-            else:
-                trainings = Spread(float(sd) / math.sqrt(count), count - 1)
-                found.append(self.rule.half(trainings, each.images, level))
-        return found
+def _half_width(evidence: Evidence, rule: Rule, level: float, seeds: int = 0) -> float:
+    """Return half of the width of an interval, with `seeds` seeds where they are more.
 
-    def standings(self, kind: Kind, seeds: int = 0) -> Values:
-        """Margins in half widths, above 1 inside the range ("contradicted": outside).
+    Infinite or NaN where there is no interval.
+    """
+    if evidence.images is None:
+        return math.nan
+    if not evidence.seeds:  # all terms are fixed
+        return student(0.0, evidence.images, level).half
+    sd = float(np.std(evidence.values, ddof=1)) if len(evidence.values) > 1 else math.nan
+    if math.isnan(sd):
+        return math.inf
+    count = max(len(evidence.seeds), seeds)
+    return rule.half(Spread(sd / math.sqrt(count), count - 1), evidence.images, level)
 
-        0 where there is no interval, or neither a margin nor a width.
-        """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = self.margins / np.array(self.halves(kind, seeds))
-        return np.where(np.isnan(found), 0.0, -found if kind == "contradicted" else found)
 
-    def kind(self, seeds: int = 0) -> Kind:
-        """The verdict, by the present seeds or as if there were `seeds`."""
-        if (self.standings("holds", seeds) > 1).sum() >= self.needed:
-            return "holds"
-        if (self.standings("contradicted", seeds) > 1).sum() >= self.against:
-            return "contradicted"
-        return "undecided"
+def _standings(
+    evidences: Sequence[Evidence],
+    wanted: tuple[float, float],
+    rule: Rule,
+    level: float,
+    seeds: int = 0,
+) -> Values:
+    """Return margins in half widths: above 1 inside the range, below -1 outside.
 
-    def decisive(self, kind: Kind) -> int:
-        """The contrast that is the last one to make the verdict, or the first one to prevent it."""
-        order = np.argsort(-self.standings(kind), kind="stable")
-        return int(order[(self.against if kind == "contradicted" else self.needed) - 1])
+    0 where there is no interval, or neither a margin nor a width.
+    """
+    estimates = np.array([np.mean(evidence.values) for evidence in evidences])
+    margins = np.minimum(estimates - wanted[0], wanted[1] - estimates)
+    halves = np.array([_half_width(evidence, rule, level, seeds) for evidence in evidences])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = margins / halves
+    return np.where(np.isnan(found), 0.0, found)
 
-    def seeds_needed(self) -> float:
-        """See `Verdict.seeds_needed`; more seeds never make an interval wider."""
-        if self.kind(MOST_SEEDS) != "undecided":
-            counts = range(2, MOST_SEEDS)
-            found = bisect_left(counts, True, key=lambda seeds: self.kind(seeds) != "undecided")
-            return float(2 + found)
-        unknown = any(each.images is None or len(each.seeds) == 1 for each in self.evidences)
-        return math.nan if unknown else math.inf
+
+def _kind(
+    evidences: Sequence[Evidence],
+    wanted: tuple[float, float],
+    rule: Rule,
+    needed: int,
+    seeds: int = 0,
+) -> Kind:
+    """Decide by the present seeds, or as if there were `seeds`."""
+    against = len(evidences) - needed + 1
+    to_hold = _standings(evidences, wanted, rule, _level(rule, against), seeds)
+    if (to_hold > 1).sum() >= needed:
+        return "holds"
+    to_contradict = _standings(evidences, wanted, rule, _level(rule, needed), seeds)
+    if (to_contradict < -1).sum() >= against:
+        return "contradicted"
+    return "undecided"
+
+
+def _seeds_needed(
+    evidences: Sequence[Evidence], wanted: tuple[float, float], rule: Rule, needed: int
+) -> float:
+    """Search `Verdict.seeds_needed`; more seeds never make an interval wider."""
+
+    def is_decided(seeds: int) -> bool:
+        return _kind(evidences, wanted, rule, needed, seeds) != "undecided"
+
+    if is_decided(MOST_SEEDS):
+        found = bisect_left(range(2, MOST_SEEDS), True, key=is_decided)
+        return float(2 + found)
+    for evidence in evidences:
+        if evidence.images is None or len(evidence.seeds) == 1:
+            return math.nan
+    return math.inf
 
 
 def _reason(kind: Kind, shown: Evidence, half: float, seeds_needed: float) -> str:

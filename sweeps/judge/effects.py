@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.uncertainty.contrasts import Evidence, Term, combine
-from analysis.uncertainty.effects import Effect, Noise, estimate_effects
+from analysis.uncertainty.effects import Noise, estimate_effects
+from analysis.uncertainty.estimates import Estimate
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT
 from sweeps.judge.contrasts import Cell
@@ -123,9 +124,9 @@ def _lines(
             signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
             estimated += estimate_effects(cells, signs, NOISE[part])
     lines = []
-    for name, effect in zip((MEAN, *groups), estimated, strict=True):
-        estimate, evidence = effect.estimate, effect.estimate.evidence
-        interval, trainings = estimate.both, evidence.trainings
+    for name, estimate in zip((MEAN, *groups), estimated, strict=True):
+        evidence, interval = estimate.evidence, estimate.both
+        trainings = evidence.trainings
         is_plain_mean = name == MEAN and not start["against"]
         lines.append(
             {
@@ -135,8 +136,8 @@ def _lines(
                 "low": math.nan if interval is None else interval.low,
                 "high": math.nan if interval is None else interval.high,
                 "p": math.nan if interval is None else estimate.p,
-                "p_holm": effect.corrected,
-                "shown": ABSENT if is_plain_mean else _word(effect),
+                "p_holm": estimate.p_corrected,
+                "shown": ABSENT if is_plain_mean else _word(estimate),
                 "error_seeds": trainings.error if trainings else math.nan,
                 "error_images": evidence.error,
                 "seeds": estimate.seeds,
@@ -146,10 +147,9 @@ def _lines(
     return lines
 
 
-def _word(effect: Effect) -> str:
-    estimate = effect.estimate
+def _word(estimate: Estimate) -> str:
     if estimate.both is None:
         return "2 seeds needed" if estimate.seeds < 2 else "too few images"
-    if not effect.is_shown():
+    if not estimate.is_shown():
         return "no"
     return "higher" if estimate.value > 0 else "lower"

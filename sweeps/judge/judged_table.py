@@ -16,7 +16,7 @@ from statistics import fmean
 from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.same_images import Alike
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, Verdict, decide
+from analysis.uncertainty.verdicts import Rule, Verdict, decide
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.runs.result import RunResult
@@ -127,12 +127,12 @@ class JudgedTable:
         The tag of any table counts, because tables share runs.
         """
         if self.request.until_decided:
-            return AnyTime()
+            return Rule(any_time=True)
         for outcome in self.runs.values():
             for run in outcome.results:
                 if any(name.startswith(UNTIL_DECIDED) for name in run.tags):
-                    return AnyTime()
-        return FixedSeeds()
+                    return Rule(any_time=True)
+        return Rule()
 
     def resampler(self, alike: Alike = "labels") -> Resampler:
         """Return the engine for images with equal labels, or "names" for the worlds of a design.

@@ -26,7 +26,11 @@ def counts_of(array: Any, **changed: Any) -> Counts:
         "partition": f"ring{counts.shape[1]}",
     }
     values |= changed
-    own = {each.name: values.pop(each.name) for each in fields(Counts) if each.name in values}
+    own = {
+        name: values.pop(name)
+        for name in [field.name for field in fields(Counts)]
+        if name in values
+    }
     return Counts(counts=counts, **({"measurement": measurement(**values)} | own))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from analysis import archive
+from analysis import packing
 from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.files.plain_files import write_json
@@ -98,13 +98,17 @@ def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
         for path in unpacked.folder.rglob("*.*")
         if path.suffix in (".npz", ".json")
     }
-    for name in (each for each in names if each.endswith(".npz")):
+    for name in names:
+        if not name.endswith(".npz"):
+            continue
         path = run.folder / name
         first, again = Counts.load(path), unpacked.counts(name)
         assert np.array_equal(first.counts, again.counts)
         assert first.counts.dtype == again.counts.dtype
         others = [field.name for field in fields(Counts) if field.name != "counts"]
-        assert [getattr(first, each) for each in others] == [getattr(again, e) for e in others]
+        assert [getattr(first, field) for field in others] == [
+            getattr(again, field) for field in others
+        ]
         assert first.measurement.to_json() == again.measurement.to_json()
     assert (unpacked.key, unpacked.commit) == (run.key, "a" * 10)
     assert unpacked.recorded_scores() == run.recorded_scores()
@@ -174,14 +178,14 @@ def test_archive_that_fills_the_memory_is_refused(
 ) -> None:
     path = archived_in(tmp_path)
     with zipfile.ZipFile(path) as members:
-        total = sum(each.file_size for each in members.infolist())
+        total = sum(member.file_size for member in members.infolist())
     for most in (total - 1, total):  # members; texts, which are longer
-        monkeypatch.setattr(archive, "MOST", most)
+        monkeypatch.setattr(packing, "MOST", most)
         with pytest.raises(InputError, match=f"damaged .it unpacks to more than {most} bytes"):
             unpack(path, tmp_path / "unpacked")
-    assert archive._decompressed(lzma.compress(bytes(total))) == bytes(total)
+    assert packing._decompressed(lzma.compress(bytes(total))) == bytes(total)
     with pytest.raises(ValueError, match="unpacks to more"):
-        archive._decompressed(lzma.compress(bytes(total + 1)))
+        packing._decompressed(lzma.compress(bytes(total + 1)))
 
 
 def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:
@@ -238,7 +242,7 @@ def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Pa
     archive = tmp_path / "new"
     words = (f"runs_dir={run.folder.parent}", f"archive={archive}")
     assert call(entry, "add", "run=all", *words)[0] == 0
-    assert [each.stem for each in archived(archive)] == [run.key]
+    assert [path.stem for path in archived(archive)] == [run.key]
     code, out, err = call(entry, "check", f"archive={archive}")
     assert (code, err.strip()) == (0, "")
     assert "1 runs, 1 have the scores of their counts and today's key" in out
@@ -349,7 +353,7 @@ def test_changed_numbers_are_no_result(
         changed = {**result, "test": {**result["test"], **scores}}
         write_json(
             run.folder / "result.json",
-            {name: each for name, each in changed.items() if (kind, name) != ("no_key", "key")},
+            {name: value for name, value in changed.items() if (kind, name) != ("no_key", "key")},
         )
         message = "names no run" if kind == "no_key" else "but its counts give"
     if kind != "settings":

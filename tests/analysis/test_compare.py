@@ -60,26 +60,28 @@ def test_table_sentence_and_files_hold_the_compared_numbers(
     assert "A class without a pixel counts as 0 (absent=released)." in out
     text = (tmp_path / "new" / "out" / "comparison.md").read_text()
     assert next(line for line in out.splitlines() if "As trained here" in line) in text
-    found = compare(*([each] for each in pair()), ["mIoU", "Var", "region/1", "region/2"], SETTINGS)
+    found = compare(
+        *([counts] for counts in pair()), ["mIoU", "Var", "region/1", "region/2"], SETTINGS
+    )
     rows = lines_of(tmp_path / "new" / "out")
-    assert [row["metric"] for row in rows] == [each.metric for each in found.differences]
-    for row, each in zip(rows, found.differences, strict=True):
+    assert [row["metric"] for row in rows] == [line.metric for line in found.differences]
+    for row, line in zip(rows, found.differences, strict=True):
         numbers = {
-            "a": each.a.value,
-            "b": each.b.value,
-            "difference": each.value,
-            "images_low": each.interval.low,
-            "images_high": each.interval.high,
-            "p": each.difference.p,
-            "p_holm": each.p_corrected,
+            "a": line.a.value,
+            "b": line.b.value,
+            "difference": line.value,
+            "images_low": line.interval.low,
+            "images_high": line.interval.high,
+            "p": line.difference.p,
+            "p_holm": line.difference.p_corrected,
             "seeds_a": 1,
             "seeds_b": 1,
         }
         assert {key: float(row[key]) for key in numbers} == pytest.approx(numbers, rel=1e-6)
         assert row["both_low"] == row["both_high"] == ""
-        shown = [f"{each.a.value:.2f}", f"{each.b.value:.2f}", f"{each.value:+.2f}"]
-        ends = f"{each.interval.low:+.2f} to {each.interval.high:+.2f}"
-        assert " | ".join([each.metric, *shown, ends]) in text
+        shown = [f"{line.a.value:.2f}", f"{line.b.value:.2f}", f"{line.value:+.2f}"]
+        ends = f"{line.interval.low:+.2f} to {line.interval.high:+.2f}"
+        assert " | ".join([line.metric, *shown, ends]) in text
 
 
 def test_other_measurements_are_said_and_are_no_seeds(call: Call, tmp_path: Path) -> None:
@@ -225,10 +227,10 @@ def test_arguments_that_make_no_sense_are_refused(
 ) -> None:
     make_run(tmp_path / "runs", "aaa0", "crm", 0)
     words = (*files, *FAST, f"runs_dir={tmp_path}/runs", "archive=none")
-    given = dict(each.split("=", 1) for each in words)
+    given = dict(word.split("=", 1) for word in words)
     if "aaa0" in arguments[0]:
         given["a"] = "aaa0"
-    given |= dict(each.format(tmp_path).split("=", 1) for each in arguments)
+    given |= dict(word.format(tmp_path).split("=", 1) for word in arguments)
     code, out, err = call(entry, *(f"{key}={text}" for key, text in given.items()))
     assert (code, out) == (2, "")
     assert_one_sentence(err, word.format(tmp_path))

@@ -116,7 +116,7 @@ def test_seeds_of_a_method_are_shown_together(call: Call, runs: Path, tmp_path: 
         ("", "rgbt"),
         *((kind, view) for kind in ("boundary", "calibration") for view in ("rgbt", "thermal")),
     }
-    (row,) = (each for each in rows if (each["metric"], each["input"]) == ("ECE", "rgbt"))
+    (row,) = (row for row in rows if (row["metric"], row["input"]) == ("ECE", "rgbt"))
     expected = [value("ECE", calibrated(seed), "released") for seed in range(2)]
     assert float(row["value"]) == pytest.approx(np.mean(expected))
     assert float(row["low"]) < float(row["value"]) < float(row["high"])
@@ -170,5 +170,5 @@ def test_interval_of_a_calibration_error_holds_the_truth(gap: float) -> None:
     truth = 100 * float(ece(drawn(50_000).sum(0)))
     settings = Resampling(resamples=300, blocks="none")
     found = [counts_of(drawn(60), "ring1-calibration-15") for _ in range(100)]
-    holds = sum(truth in estimate([each], ["ECE"], settings)["ECE"].images for each in found)
+    holds = sum(truth in estimate([counts], ["ECE"], settings)["ECE"].images for counts in found)
     assert holds >= 88  # 95 but for chance

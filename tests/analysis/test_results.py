@@ -94,12 +94,12 @@ def runs(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_names_open_runs_groups_files_and_lists(runs: Path, text: str, keys: str, label: str):
     found = open_counts(text.format(runs=runs), runs)
-    assert [each.key or "-" for each in found] == keys.split()
+    assert [opened.key or "-" for opened in found] == keys.split()
     assert label_of(found) == label
-    for each in found:
-        if each.run is not None and each.seed is not None:
-            assert each.path == (runs / each.key / "counts_test.npz").resolve()
-            np.testing.assert_array_equal(each.counts.counts, some(each.seed).counts)
+    for opened in found:
+        if opened.run is not None and opened.seed is not None:
+            assert opened.path == (runs / opened.key / "counts_test.npz").resolve()
+            np.testing.assert_array_equal(opened.counts.counts, some(opened.seed).counts)
 
 
 def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.MonkeyPatch):
@@ -181,7 +181,7 @@ def test_folder_and_archive_are_one(
     assert finished_runs("none", "none") == []
     for text, seeds in ((CRM, [0, 1, 2]), ("aaa1", [1])):
         opened = open_counts(text, "none", archive=archive)
-        assert [each.seed for each in opened] == seeds
+        assert [evaluation.seed for evaluation in opened] == seeds
     unpacked = finished_runs("none", archive)[0].folder
     (unpacked / "mark").touch()
     assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
@@ -210,8 +210,9 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     ):
         for name in ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "pixel_accuracy"):
             for prefix in ("", "night/")[: 1 + (of is counts)]:
-                each = parse(f"{prefix}{name}")
-                key = each.part or "all", each.region or 0, each.class_name or "", each.score
+                parsed = parse(f"{prefix}{name}")
+                place = parsed.part or "all", parsed.region or 0, parsed.class_name or ""
+                key = *place, parsed.score
                 assert found[run, condition, *key] == value(f"{prefix}{name}", of, "released")
     region = remeasured(replace(counts, counts=counts.counts[:, 1:]), partition="ring1")
     person = value("class/person", region, "released")
@@ -253,16 +254,16 @@ def measured(tmp_path: Path) -> Path:
 
 
 def test_trainings_have_levels_by_title_and_rising_severity(measured: Path) -> None:
-    first, second = trainings("crm", measured)
-    assert [level.path.stem for level in first.levels] == [
+    (_, first), (_, second) = trainings("crm", measured)
+    assert [level.path.stem for level in first] == [
         *("counts_test", "test_rgb_removed", "test_thermal", "test_noise-8", "test_noise-16")
     ]
-    mious = [value("mIoU", level.counts, "released") for level in first.levels]
+    mious = [value("mIoU", level.counts, "released") for level in first]
     assert mious == pytest.approx([80, 20, 30, 60, 40], abs=1e-3)
-    assert value("mIoU", second.levels[0].counts, "released") == pytest.approx(70, abs=1e-3)
-    assert [level.severity for level in first.levels if level.condition == "noise"] == [8, 16]
+    assert value("mIoU", second[0].counts, "released") == pytest.approx(70, abs=1e-3)
+    assert [level.severity for level in first if level.condition == "noise"] == [8, 16]
     folder = write_levels(measured / "elsewhere", SCORES)
-    assert [each.label for each in trainings(f"{folder},k2", measured)] == ["elsewhere", "none"]
+    assert [label for label, _ in trainings(f"{folder},k2", measured)] == ["elsewhere", "none"]
 
 
 @pytest.mark.parametrize(
@@ -270,10 +271,10 @@ def test_trainings_have_levels_by_title_and_rising_severity(measured: Path) -> N
 )
 def test_same_trainings_on_corrupted_images(measured: Path, condition: str, miou: int) -> None:
     found = open_counts("crm", measured, condition=condition)
-    assert [value("mIoU", each.counts, "released") for each in found] == pytest.approx(
+    assert [value("mIoU", opened.counts, "released") for opened in found] == pytest.approx(
         [miou, miou - 10], abs=1e-3
     )
-    assert [each.seed for each in found] == [0, 1]
+    assert [opened.seed for opened in found] == [0, 1]
 
 
 @pytest.mark.parametrize("condition", ["nois 16", "noise 12"])
@@ -298,5 +299,5 @@ def test_levels_of_weights_that_were_all_predicted_otherwise_are_found(tmp_path:
     (tmp_path / "measured").mkdir()
     for name, counts in (("clean", clean), ("noise", noisy)):
         counts.save(tmp_path / "measured" / f"{name}.npz")
-    (training,) = trainings(str(tmp_path / "measured"))
-    assert [row_of(level) for level in training.levels] == ["clean", "noise"]
+    ((_, levels),) = trainings(str(tmp_path / "measured"))
+    assert [row_of(level) for level in levels] == ["clean", "noise"]

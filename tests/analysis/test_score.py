@@ -139,7 +139,7 @@ def test_grids_show_the_numbers() -> None:
     bounded = (frame["metric"] == "mIoU") & (frame["absent"] == "exclude")
     bounded &= (frame["region"] == 1) & (frame["subset"] == "all")
     frame.loc[bounded, ["low", "high"]] = 80.04, 85.0
-    ious, accuracies, parts = (each for each in score_tables(frame, counts, "said"))
+    ious, accuracies, parts = score_tables(frame, counts, "said")
     rows = {row[0]: row[1:] for row in ious.rows}
     assert ious.header == ("", "whole", "region 1", "region 2")
     assert rows["mIoU released"] == ("61.88", "55.77", "41.88")
@@ -195,7 +195,7 @@ def test_a_folder_holds_scores_of_one_method(
     assert f"give counts={out} its own folder" in err
     # The same method again: nothing of the first time is left, and nothing of others is touched.
     assert call(entry, *arguments, "regions=3")[0] == 0
-    counted = {f"counts_{each}3.npz" for each in ("ring", "vertical", "horizontal")}
+    counted = {f"counts_{kind}3.npz" for kind in ("ring", "vertical", "horizontal")}
     left = {path.name for path in out.glob("*.npz")}
     assert left == counted | {"counts_test.npz", "maps.npz"}
 

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.spatial import entry
 from analysis.statistics.collect import SpatialStatistics
-from analysis.statistics.sample import Sample
+from analysis.statistics.resampled import ResampledSplit
 from tests.commands import Call
 from tests.data.layouts import write_kp
 
@@ -42,11 +42,13 @@ def test_command_prints_tables_and_writes_files(call: Call, data: Path, tmp_path
         if row["region"] == "4" and not row["class"]
     }
     snr = found["night", "snr", "thermal", "wavelet_mad", "images"]
-    expected = Sample(stats).snr("night", ("wavelet_mad", "images"))[0, 1, 3]
+    expected = ResampledSplit(stats).snr("night", ("wavelet_mad", "images"))[0, 1, 3]
     assert float(snr["value"]) == pytest.approx(expected, rel=1e-6)
     assert snr["images"] == "4"
     occupancy = found["all", "occupancy", "", "", ""]
-    assert float(occupancy["value"]) == pytest.approx(Sample(stats).occupancy()[0, 3], rel=1e-6)
+    assert float(occupancy["value"]) == pytest.approx(
+        ResampledSplit(stats).occupancy()[0, 3], rel=1e-6
+    )
     assert "**signal to noise (Eq. 4; std, images)**" in (out / "statistics.md").read_text()
 
 

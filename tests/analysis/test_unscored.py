@@ -56,14 +56,14 @@ def test_difference_in_unscored_classes_only_is_none() -> None:
     wide[..., :4, :4] = first.counts
     moved = wide.copy()
     moved[..., 3, 4], moved[..., 3, 3] = wide[..., 3, 3], 0
-    a, b = (replace(first, counts=each, **every) for each in (wide, moved))
+    a, b = (replace(first, counts=array, **every) for array in (wide, moved))
     metrics = ["mIoU", "Var", "mAcc", "mPrecision", "mF1", "region/1"]
     for difference in compare([a], [b], metrics, FEW).differences:
         assert difference.value == 0, difference.metric
         assert difference.interval is not None
         assert (difference.interval.low, difference.interval.high) == (0, 0)
         assert difference.difference.p == 1
-    both = [replace(each, unscored=()) for each in (a, b)]
+    both = [replace(counts, unscored=()) for counts in (a, b)]
     (scored,) = compare([both[0]], [both[1]], ["mIoU"], FEW).differences
     assert scored.value < -1
     assert scored.difference.p < 0.05

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Resampler, Term
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, decide
+from analysis.uncertainty.verdicts import Rule, decide
 from rgbt.tables import TextTable
 from tests.analysis.uncertainty.simulated import Population, counts_of
 from tests.analysis.uncertainty.simulated_claims import (
@@ -37,9 +37,9 @@ EFFECT = 2.0
 RATIOS = (0.0, 0.3, 1.0, 3.0)
 LONGEST = 200
 RULES: dict[str, tuple[Callable[[np.ndarray, float, Rule], Outcome], Rule]] = {
-    "any time, 3 to 20 seeds": (until_decided, AnyTime()),
-    "repeated fixed t, 3 to 20": (until_decided, FixedSeeds()),
-    **{f"fixed, {seeds} seeds": (with_seeds(seeds), FixedSeeds()) for seeds in (3, 5, 10)},
+    "any time, 3 to 20 seeds": (until_decided, Rule(any_time=True)),
+    "repeated fixed t, 3 to 20": (until_decided, Rule()),
+    **{f"fixed, {seeds} seeds": (with_seeds(seeds), Rule()) for seeds in (3, 5, 10)},
 }
 
 
@@ -117,7 +117,7 @@ def first_verdict(resampler: Resampler, terms: Sequence[Term], last: int) -> Out
             )
             for term in terms
         ]
-        kind = decide([resampler.evidence(shown)], HIGHER, AnyTime(), "all").kind
+        kind = decide([resampler.evidence(shown)], HIGHER, Rule(any_time=True), "all").kind
         if kind != "undecided":
             return kind, seeds
     return "undecided", last

@@ -22,9 +22,8 @@ def texts(figure: Figure, folder: Path) -> list[str]:
     path = folder / "drawn.svg"
     save(figure, path)
     root = ElementTree.parse(path).getroot()
-    return [
-        "".join(each.itertext()).strip() for each in root.iter("{http://www.w3.org/2000/svg}text")
-    ]
+    found = root.iter("{http://www.w3.org/2000/svg}text")
+    return ["".join(text.itertext()).strip() for text in found]
 
 
 def letters(figure: Figure, folder: Path) -> list[float]:
@@ -62,7 +61,7 @@ def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -
         night=night,
         labels=np.array(inside, np.int64),
         ignored=np.zeros((len(labels), number), np.int64),
-        occupied=np.stack([one_hot[each].sum(0) for each in (~dark, dark)]).astype(np.int32),
+        occupied=np.stack([one_hot[part].sum(0) for part in (~dark, dark)]).astype(np.int32),
         laplacian=full + 10 * (m + 1) * (n + 1) + r,
         mean=full + 100.0 + n,
         noise=np.stack([full + (m + 1.0) * (r + 1), full, full + 20.0], axis=1),

@@ -18,8 +18,8 @@ def write_framed(folder: Path) -> None:
     """Write mf (data set of 48 x 64 pixels), pairs (export), a and b (predictions)."""
     rng = np.random.default_rng(0)
     root = folder / "mf"
-    for each in ("images", "labels"):
-        (root / each).mkdir(parents=True)
+    for kind in ("images", "labels"):
+        (root / kind).mkdir(parents=True)
     (root / "test.txt").write_text("\n".join(NAMES))
     for name in NAMES:
         pair = rng.integers(0, 256, (48, 64, 4), dtype=np.uint8)

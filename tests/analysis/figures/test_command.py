@@ -39,13 +39,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert label is not None
             wrong = (label + shift * (np.arange(96) < index)) % 9
             cv2.imwrite(str(folder / method / f"{name}.png"), wrong.astype(np.uint8))
-        scored = score_folder(
-            folder / method, dataset, "test", ScoringOptions(regions=5, threads=1)
-        )
-        for each in scored.counts:
-            each.save(folder / method / f"counts_{each.partition}.npz")
-        assert scored.maps is not None
-        scored.maps.save(folder / method / "maps.npz")
+        scored = score_folder(folder / method, dataset, "test", ScoringOptions(regions=5))
+        scored.save(folder / method)
     labels = np.random.default_rng(0).integers(0, 3, (20, 64, 96), dtype=np.uint8)
     night = np.arange(20) % 2 == 0
     measured = statistics(labels, strips(5, "ring"), night)
@@ -167,10 +162,10 @@ def test_every_figure_is_drawn(call: Call, made: Path, tmp_path: Path, figure: s
 def test_lists_every_figure_with_its_options(call: Call) -> None:
     code, out, _ = call(entry)
     assert code == 0
-    for name, each in FIGURES.items():
+    for name, spec in FIGURES.items():
         (line,) = [line for line in out.splitlines() if line.split()[:1] == [name]]
-        assert each.shows in line
-        assert ("methods" in line) == ("methods=..." in each.words or name == "spatialseg/fig3")
+        assert spec.shows in line
+        assert ("methods" in line) == ("methods=..." in spec.words or name == "spatialseg/fig3")
 
 
 @pytest.mark.parametrize(
@@ -189,7 +184,7 @@ def test_lists_every_figure_with_its_options(call: Call) -> None:
     ],
 )
 def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], word: str) -> None:
-    given = dict(each.split("=", 1) for each in ("out=f.pdf", *words))
+    given = dict(word.split("=", 1) for word in ("out=f.pdf", *words))
     code, out, err = call(entry, f"figure={figure}", *(f"{k}={v}" for k, v in given.items()))
     assert (code, out) == (2, "")
     assert word in err
@@ -216,7 +211,7 @@ def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], wo
 def test_input_that_does_not_fit_is_refused(
     call: Call, made: Path, tmp_path: Path, figure: str, change: list[str], word: str
 ) -> None:
-    words = [*arguments(figure, made), *(each.format(made) for each in change)]
+    words = [*arguments(figure, made), *(word.format(made) for word in change)]
     code, _, err = call(entry, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
     assert code == 2
     assert word in " ".join(err.split())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,14 +17,13 @@ from analysis.figures.panels import (
     HIDDEN,
     PATCHES,
     STRIDE,
-    Frame,
     FramePair,
-    PairOptions,
-    Pairs,
+    PictureOptions,
     draw_pairs,
-    mask_examples,
     masker_overrides,
     panel,
+    read_pairs,
+    under_mask,
 )
 from rgbt import consistency
 from rgbt.checks import InputError
@@ -113,12 +112,16 @@ def config_of(folder: Path, *more: str) -> Config:
 
 
 def values(folder: Path, **changed) -> dict:
-    methods = ",".join(f"{each.upper()}:{folder / each}" for each in METHODS)
-    return {"pairs": str(folder / "pairs"), "methods": methods} | changed
+    methods = ",".join(f"{method.upper()}:{folder / method}" for method in METHODS)
+    return {"pairs": str(folder / "pairs"), "methods": methods, "view_set": 1} | changed
 
 
-def opened(folder: Path, config: Config | None = None, **changed) -> Pairs:
-    return Pairs(config or config_of(folder), PairOptions(**values(folder, **changed)))
+def opened(
+    folder: Path, names: Sequence[str], config: Config | None = None, **changed
+) -> tuple[list[FramePair], str]:
+    given = values(folder, **changed)
+    options = PictureOptions(methods=given["methods"], names=",".join(names))
+    return read_pairs(config or config_of(folder), options, given["pairs"], given["view_set"])
 
 
 def pixels(counts: Counts, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,9 +141,8 @@ def test_outlined_pixels_are_those_that_the_measurement_counts(
     assert call(consistency.entry, *words, *data)[0] == 0
     counts = Counts.load(tmp_path / "test_aligned3.npz")
     for view in (1, 2, 3):
-        pairs = opened(framed, view_set=view)
-        for name, total, wrong in zip(counts.names, *pixels(counts, view - 1), strict=True):
-            found = pairs.read(name)
+        pairs, _ = opened(framed, counts.names, view_set=view)
+        for found, total, wrong in zip(pairs, *pixels(counts, view - 1), strict=True):
             assert 0 < wrong < total
             assert (found.compared.sum(), found.differ[1].sum()) == (total, wrong)
             assert found.shares[1] == pytest.approx(100 * wrong / total)
@@ -157,10 +159,9 @@ def test_outlined_pixels_of_true_second_frames_are_those_counted(
     assert call(consistency.entry, *words, *frames)[0] == 0
     (path,) = tmp_path.glob("test_next1-*.npz")  # marked by the motion of the data set
     counts = Counts.load(path)
-    pairs = opened(tmp_path, Config(SYNTH))
-    assert pairs.second == "next frame"
-    for name, total, wrong in zip(counts.names, *pixels(counts, 0), strict=True):
-        found = pairs.read(name)
+    pairs, second = opened(tmp_path, counts.names, Config(SYNTH))
+    assert second == "next frame"
+    for found, total, wrong in zip(pairs, *pixels(counts, 0), strict=True):
         assert (found.compared.sum(), found.differ[0].sum()) == (total, wrong)
 
 
@@ -168,20 +169,22 @@ def test_frames_equal_those_of_data_set_and_export(framed: Path) -> None:
     packed = cv2.imread(str(framed / "mf" / "images" / "00000D.png"), cv2.IMREAD_UNCHANGED)
     second = cv2.imread(str(framed / "pairs" / "rgb" / "00000D_view2.png"))
     heat = cv2.imread(str(framed / "pairs" / "thermal" / "00000D_view2.png"), cv2.IMREAD_GRAYSCALE)
-    first, later = opened(framed, view_set=2).read("00000D").frames
-    np.testing.assert_array_equal(first.rgb, packed[..., 2::-1])
-    np.testing.assert_array_equal(first.thermal, packed[..., 3])
-    np.testing.assert_array_equal(later.rgb, second[..., ::-1])
-    np.testing.assert_array_equal(later.thermal, heat)
+    ((pair,), what) = opened(framed, ["00000D"], view_set=2)
+    assert (what, pair.first.name, pair.second.name) == ("synthesised", "00000D", "00000D_view2")
+    np.testing.assert_array_equal(pair.first.rgb, packed[..., 2::-1])
+    np.testing.assert_array_equal(pair.first.thermal, packed[..., 3])
+    np.testing.assert_array_equal(pair.second.rgb, second[..., ::-1])
+    np.testing.assert_array_equal(pair.second.thermal, heat)
 
 
 def frame_pair() -> FramePair:
     """Two frames of 2 x 3 pixels; method B changes its mind about one of four compared pixels."""
-    frames = tuple(
-        Frame(
+    first, second = (
+        Sample(
             rgb=np.full((2, 3, 3), 10 * index, np.uint8),
             thermal=np.array([[50, 100, 50], [50, 60 + 90 * index, 50]], np.uint8),
             label=np.array([[0, 1, 2], [0, 0, 255 * index]], np.uint8),
+            name="00001N",
         )
         for index in (0, 1)
     )
@@ -190,7 +193,7 @@ def frame_pair() -> FramePair:
     one[0, 1] = True
     compared = np.array([[True, True, False], [True, True, False]])
     predictions = ((class_map, class_map), (class_map, class_map))
-    return FramePair("00001N", (frames[0], frames[1]), predictions, (none, one), compared)
+    return FramePair(first, second, predictions, (none, one), compared)
 
 
 @pytest.mark.parametrize("layout", ["rows", "columns"])
@@ -200,8 +203,8 @@ def test_real_and_synthesised_frames_are_side_by_side(layout: str, tmp_path: Pat
     legend = (CLASSES, PALETTE, [])
     figure = draw_pairs([pair, pair], ("A", "B"), legend, "synthesised", layout)
     said = texts(figure, tmp_path)
-    assert [said.count(each) for each in ("00001N", "synthesised", "0.0 %", "25.0 %")] == [2] * 4
-    assert [said.count(each) for each in ("RGB", "thermal", "A", "B")] == [1] * 4
+    assert [said.count(text) for text in ("00001N", "synthesised", "0.0 %", "25.0 %")] == [2] * 4
+    assert [said.count(text) for text in ("RGB", "thermal", "A", "B")] == [1] * 4
     order = np.arange(20).reshape(4, 5)  # frames x what is shown of each
     order = order if layout == "rows" else order.T
     for place, axes in zip(order.flat, figure.axes, strict=True):
@@ -221,16 +224,16 @@ def test_real_and_synthesised_frames_are_side_by_side(layout: str, tmp_path: Pat
 
 def test_pairs_that_do_not_fit_are_refused(framed: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="view_set=4: the export has no such set"):
-        opened(framed, view_set=4)
+        opened(framed, [], view_set=4)
     for config in (config_of(framed, "consistency.view.camera.fx=500"), Config(SYNTH)):
         with pytest.raises(InputError, match="exported from other images or other second frames"):
-            opened(framed, Config(config.overrides, {"consistency": "views"}))
+            opened(framed, [], Config(config.overrides, {"consistency": "views"}))
     with pytest.raises(InputError, match="there is no prediction"):
-        opened(framed, methods=f"A:{tmp_path}").read("00000D")
+        opened(framed, ["00000D"], methods=f"A:{tmp_path}")
     listed = json.loads((framed / "pairs" / "pairs.json").read_text())
     write_json(tmp_path / "pairs.json", listed | {"complete": False})
     with pytest.raises(InputError, match="was interrupted; rerun its command"):
-        opened(framed, pairs=str(tmp_path))
+        opened(framed, [], pairs=str(tmp_path))
 
 
 # Masks.
@@ -242,17 +245,6 @@ def sample(height: int = 100, width: int = 140) -> Sample:
     return Sample(rgb=rgb, thermal=rgb[..., 0].copy(), label=None, name="00001D")
 
 
-@cache
-def maskers():
-    return {
-        title: build(compose(words).masker) for title, words in masker_overrides(PATCHES).items()
-    }
-
-
-def examples(seed: int = 0):
-    return mask_examples(sample(), maskers(), math.lcm(STRIDE, *PATCHES), seed)
-
-
 def test_known_mask_hides_its_cells_in_the_cut_image() -> None:
     """100 x 140 cut to 64 x 128 around the middle: from row 18, column 6."""
 
@@ -261,26 +253,29 @@ def test_known_mask_hides_its_cells_in_the_cut_image() -> None:
         cells = torch.tensor([[[True, False]]])
         return MaskPair(cells, ~cells)
 
-    (found,) = mask_examples(sample(), {"left": left_half}, 64, seed=0)
-    assert found.rgb_hidden[:, :64].all()
-    assert not found.rgb_hidden[:, 64:].any()
-    np.testing.assert_array_equal(found.thermal_hidden, ~found.rgb_hidden)
-    assert (found.rgb[:, :64] == HIDDEN).all()
-    np.testing.assert_array_equal(found.rgb[:, 64:], sample().rgb[18:82, 70:134])
-    np.testing.assert_array_equal(found.thermal[:, :64, 1], sample().thermal[18:82, 6:70])
+    (rgb, thermal), hidden = under_mask(sample(), left_half, 64, torch.Generator())
+    assert hidden[0, :, :64].all()
+    assert not hidden[0, :, 64:].any()
+    np.testing.assert_array_equal(hidden[1], ~hidden[0])
+    assert (rgb[:, :64] == HIDDEN).all()
+    np.testing.assert_array_equal(rgb[:, 64:], sample().rgb[18:82, 70:134])
+    np.testing.assert_array_equal(thermal[:, :64, 1], sample().thermal[18:82, 6:70])
 
 
 def test_the_maskers_of_the_paper() -> None:
-    found = {each.title: each for each in examples()}
+    found, multiple = {}, math.lcm(STRIDE, *PATCHES)
+    for title, words in masker_overrides(PATCHES).items():
+        masker = build(compose(words).masker)
+        _, hidden = under_mask(sample(), masker, multiple, torch.Generator().manual_seed(0))
+        np.testing.assert_array_equal(hidden[1], ~hidden[0])
+        found[title] = hidden[0]
     assert list(found) == ["square", *(f"{n} x {n} pixels" for n in PATCHES)]
-    for each in found.values():
-        np.testing.assert_array_equal(each.thermal_hidden, ~each.rgb_hidden)
     for size in PATCHES:
-        hidden = found[f"{size} x {size} pixels"].rgb_hidden
+        hidden = found[f"{size} x {size} pixels"]
         cells = hidden[::size, ::size]
         np.testing.assert_array_equal(np.kron(cells, np.ones((size, size), bool)), hidden)
         assert cells.mean() == 0.5
-    rows, columns = np.nonzero(found["square"].rgb_hidden)
-    box = found["square"].rgb_hidden[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    rows, columns = np.nonzero(found["square"])
+    box = found["square"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     assert box.all()
     assert box.shape == (32, 64)  # half of each side

@@ -61,7 +61,7 @@ def test_bars_of_series_stand_side_by_side() -> None:
     frame = pd.DataFrame(rows, columns=["series", "x", "value", "low", "high"])
     axes = plots.new_figure(3, 2).subplots()
     plots.line_plot(axes, frame, {"b": {"label": "other"}}, bars=True, spread=0.4)
-    first, second = (each.lines[0] for each in axes.containers)
+    first, second = (container.lines[0] for container in axes.containers)
     assert first.get_xdata().tolist() == [0.8, 1.8]
     assert second.get_xdata().tolist() == [1.2, 2.2]
     assert axes.get_legend_handles_labels()[1] == ["a", "other"]

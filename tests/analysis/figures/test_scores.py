@@ -20,7 +20,7 @@ from analysis.figures.scores import (
     map_of,
     region_means,
 )
-from analysis.results import Training, trainings
+from analysis.results import Levels, trainings
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -157,16 +157,16 @@ def test_profiles_say_what_their_intervals_cover(tmp_path: Path, number: int) ->
 
 @pytest.fixture
 def training(tmp_path: Path) -> object:
-    def made(name: str, scores: dict) -> Training:
-        (found,) = trainings(str(write_levels(tmp_path / name, scores)))
+    def made(name: str, scores: dict) -> Levels:
+        ((_, found),) = trainings(str(write_levels(tmp_path / name, scores)))
         return found
 
     return made
 
 
 @pytest.fixture
-def methods(training) -> dict[str, list[Training]]:
-    two_images = {key: each for key, each in less(20).items() if key[0] != "thermal"}
+def methods(training) -> dict[str, list[Levels]]:
+    two_images = {key: score for key, score in less(20).items() if key[0] != "thermal"}
     return {
         "CRM": [training("a", SCORES), training("b", less(10))],
         "RTFNet": [training("c", two_images)],
@@ -208,7 +208,7 @@ def test_draws_every_panel_with_its_unit_and_methods(methods, tmp_path: Path, sc
 
 
 def test_a_method_that_was_not_measured_keeps_its_colour(training) -> None:
-    few = {key: each for key, each in SCORES.items() if key[0] in ("clean", "rgb_removed")}
+    few = {key: score for key, score in SCORES.items() if key[0] in ("clean", "rgb_removed")}
     methods = {"few": [training("a", few)], "all": [training("b", less(10))]}
     figure = draw_robustness(corrupted(methods, None, ["noise"]))
     lines = {line.get_label(): line for line in figure.axes[0].lines}
@@ -220,7 +220,7 @@ def test_a_method_that_was_not_measured_keeps_its_colour(training) -> None:
 
 def test_incompatible_inputs_are_refused(training, methods) -> None:
     def ladder(*severities: float) -> dict:
-        own = {("noise", "noise", "std", each): 50 for each in severities}
+        own = {("noise", "noise", "std", severity): 50 for severity in severities}
         return {("clean", "clean", "", 0.0): 80, **own}
 
     short, long = training("s", ladder(8.0)), training("l", ladder(8.0, 16.0))
@@ -229,7 +229,7 @@ def test_incompatible_inputs_are_refused(training, methods) -> None:
             corrupted(both, "released")
     with pytest.raises(InputError, match="'nois' was not measured; did you mean 'noise'"):
         corrupted(methods, "released", ["nois"])
-    fewer = replace(short.levels[1], counts=short.levels[1].counts.select(["00000D"]))
-    cut = replace(short, levels=(short.levels[0], fewer))
+    clean, noisy = short
+    cut = clean, replace(noisy, counts=noisy.counts.select(["00000D"]))
     with pytest.raises(InputError, match="not of the same images"):
         corrupted({"x": [cut]}, "released")

@@ -21,7 +21,7 @@ from analysis.figures.spatialseg import (
 )
 from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import ScoringOptions, score_folder
-from analysis.statistics.sample import Sample
+from analysis.statistics.resampled import ResampledSplit
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
@@ -112,7 +112,7 @@ def test_occupancy_over_measured_regions_equals_statistics() -> None:
     stats = statistics(labels, RINGS, np.array([True, False, True, False, False]))
     for part in ("all", "day", "night"):
         found = occupancy_over(stats, stats.region_map, part)
-        np.testing.assert_allclose(found, Sample(stats).occupancy(part)[0])
+        np.testing.assert_allclose(found, ResampledSplit(stats).occupancy(part)[0])
 
 
 def test_changes_from_the_first_region_by_hand() -> None:
@@ -168,21 +168,23 @@ DRAWS = Resampling(resamples=400, blocks=2)
 
 def test_quality_by_region_by_hand() -> None:
     """Laplacian: mean over images n of 10 (m + 1) (n + 1) + r; SNR: 100 + n over noise."""
-    frame = by_region(Sample(SIX, DRAWS), "laplacian").set_index(["modality", "part"])["value"]
+    frame = by_region(ResampledSplit(SIX, DRAWS), "laplacian").set_index(["modality", "part"])[
+        "value"
+    ]
     for part, mean in (("all", 205), ("day", 105), ("night", 305)):
         np.testing.assert_allclose(frame["rgb", part], mean + np.arange(3))
         np.testing.assert_allclose(frame["thermal", part], 2 * mean + np.arange(3))
-    snr = by_region(Sample(SIX, DRAWS), "snr").set_index(["modality", "part"])["value"]
+    snr = by_region(ResampledSplit(SIX, DRAWS), "snr").set_index(["modality", "part"])["value"]
     np.testing.assert_allclose(snr["rgb", "all"], 119.5 / np.array([1, 2, 3]), rtol=1e-5)
     np.testing.assert_allclose(snr["thermal", "night"], 129.5 / np.array([2, 4, 6]), rtol=1e-5)
-    other = by_region(Sample(SIX, DRAWS, ("std", "images")), "snr")
+    other = by_region(ResampledSplit(SIX, DRAWS, ("std", "images")), "snr")
     np.testing.assert_allclose(other["value"][3:6], 109.5 / 20, rtol=1e-5)  # rgb by day
 
 
 @pytest.mark.parametrize("part", ["all", "day", "night"])
 def test_intervals_are_of_the_blocks_of_their_part(part: str) -> None:
     """All: 20 blocks in two strata; day and night: 10 blocks each."""
-    sample = Sample(SIX, DRAWS)
+    sample = ResampledSplit(SIX, DRAWS)
     quantile = 2.10092204024096 if part == "all" else 2.26215716279821  # t of 18 and of 9 degrees
     for quantity in ("laplacian", "snr"):
         frame = by_region(sample, quantity)
@@ -194,10 +196,10 @@ def test_intervals_are_of_the_blocks_of_their_part(part: str) -> None:
 
 
 def test_far_modalities_get_a_logarithmic_axis(tmp_path: Path) -> None:
-    near = Sample(SIX, DRAWS)
+    near = ResampledSplit(SIX, DRAWS)
     assert draw_by_region(by_region(near, "snr"), near, "SNR").axes[0].get_yscale() == "linear"
     factor = np.array([20, 1]).reshape(1, 1, 2, 1)
-    far = Sample(replace(SIX, noise=SIX.noise * factor), DRAWS)
+    far = ResampledSplit(replace(SIX, noise=SIX.noise * factor), DRAWS)
     figure = draw_by_region(by_region(far, "snr"), far, "SNR")
     assert figure.axes[0].get_yscale() == "log"
     found = texts(figure, tmp_path)

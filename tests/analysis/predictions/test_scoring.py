@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from analysis import commands
 from analysis.predictions.scoring import ScoringOptions, find, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
@@ -34,7 +35,9 @@ def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
     assert scored.name == "pred"
 
 
-def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write) -> None:
+def test_every_partition_against_a_loop_over_pixels(
+    tmp_path: Path, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(1)
     names = [f"{number:05d}{'DN'[number % 2]}" for number in range(6)]
     labels = rng.integers(0, 9, (6, 24, 32), np.uint8)
@@ -45,9 +48,10 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
     (root / "test.txt").write_text("\n".join(names))
     folder = write(dict(zip(names, predictions, strict=True)))
     dataset = MFNet(str(root))
-    one, two = (
-        score_folder(folder, dataset, "test", ScoringOptions(threads=threads)) for threads in (1, 2)
-    )
+    monkeypatch.setattr(commands, "usable_cores", lambda: 1)
+    one = score_folder(folder, dataset, "test")
+    monkeypatch.setattr(commands, "usable_cores", lambda: 2)
+    two = score_folder(folder, dataset, "test")
     for counts, again in zip(one.counts, two.counts, strict=True):
         aspect = "image" if counts.partition == "ring5" else None
         regions = Regions(
@@ -128,8 +132,8 @@ def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Wr
 def test_only_names_of_the_split_are_taken(tmp_path: Path, affixes: tuple[str, str]) -> None:
     names = ("00001D", "00002N")
     stems = [f"{affixes[0]}{name}{affixes[1]}" for name in names]
-    for each in (*stems, "mean", "00001D_overlay"):
-        (tmp_path / f"{each}.png").touch()
+    for stem in (*stems, "mean", "00001D_overlay"):
+        (tmp_path / f"{stem}.png").touch()
     paths, extra = find(tmp_path, names, Affixes(*affixes))
     assert paths == [tmp_path / f"{stem}.png" for stem in stems]
     assert extra == ("mean",)  # pictures of rgbt.predict are no stray predictions

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.statistics.sample import Sample
+from analysis.statistics.resampled import ResampledSplit
 from analysis.statistics.statements import STATEMENTS, judged, thirds
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
@@ -20,7 +20,7 @@ PLAIN = ("", "")
 
 def found_in(*, settings: Resampling = TENS, way: tuple[str, str] = PLAIN, **given) -> pd.DataFrame:
     """The rows of the statements, by key."""
-    frame = judged(Sample(made(images=IMAGES, **given), settings))
+    frame = judged(ResampledSplit(made(images=IMAGES, **given), settings))
     is_way = frame["estimator"] + frame["average"] == "".join(way)
     return frame[is_way].set_index("key")
 
@@ -56,7 +56,7 @@ def as_the_paper_says() -> dict[str, np.ndarray]:
 
 def test_a_sample_as_the_paper_says() -> None:
     frame = found_in(**as_the_paper_says())
-    plain = {each["key"] for each in STATEMENTS if each["quantity"] != "snr"}
+    plain = {stated["key"] for stated in STATEMENTS if stated["quantity"] != "snr"}
     assert set(frame.index) == plain - {"occupancy/middle"}
     even = frame.loc["classes/even"]  # curve 0.75; car 0.667 and bump 0.741
     assert even["value"] == pytest.approx(0.75 - (0.667 + 0.741) / 2, abs=0.01)
@@ -155,5 +155,5 @@ def test_without_background_no_claim_is_about_occupancy() -> None:
     frame = found_in(classes=("road", "car", "curve", "bump"), background=())
     assert not [key for key in frame.index if key.startswith("occupancy/")]
     assert frame.loc["entropy/centre"]["contrast"] == "label entropy: centre - edge, bits"
-    names = [each.partition(":")[0] for each in frame.loc["classes/central"]["contrast"]]
+    names = [what.partition(":")[0] for what in frame.loc["classes/central"]["contrast"]]
     assert names == ["road", "car", "curve"]

@@ -38,7 +38,7 @@ class Population:
     def pair(self, rng: np.random.Generator, images: int, trainings: int, other: Population):
         """Counts of two methods on the same images."""
         shared = Shared.draw(rng, self, images)
-        methods = [[shared.training(rng, each) for _ in range(trainings)] for each in (self, other)]
+        methods = [[shared.training(rng, own) for _ in range(trainings)] for own in (self, other)]
         return np.stack(methods[0]), np.stack(methods[1])
 
 

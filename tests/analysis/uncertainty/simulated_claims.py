@@ -88,7 +88,7 @@ def any_wrong(tables: int, claims: int, ratio: float, rule: Rule) -> float:
 
     def wrong() -> bool:
         drawn = [draw(rng, 0.0, ratio) for _ in range(claims)]
-        return any(until_decided(*each, rule)[0] == "holds" for each in drawn)
+        return any(until_decided(*claim, rule)[0] == "holds" for claim in drawn)
 
     return float(np.mean([wrong() for _ in range(tables)]))
 
@@ -110,7 +110,7 @@ def ever_missed(sequences: int, longest: int, ratio: float) -> dict[str, float]:
     """Share of sequences in which one interval after 2 to `longest` seeds misses the truth.
 
     Ways to join the halves over seeds and images at a level of 95 %: squares with the whole error
-    rate for each, squares with half of it for each (`AnyTime`), sums with half of it for each.
+    rate for each, squares with half of it for each (as `Rule` does), sums with half of it for each.
     """
     rng = np.random.default_rng([9, round(100 * ratio)])
     whole, split = halves(longest, 0.05), halves(longest, 0.025)

@@ -13,7 +13,7 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.blocks import ImageBlocks
 from analysis.uncertainty.contrasts import FIXED, Resampler, Term
 from analysis.uncertainty.estimates import estimate_of
-from analysis.uncertainty.verdicts import FixedSeeds, decide
+from analysis.uncertainty.verdicts import Rule, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -31,7 +31,8 @@ def rows_of(images: int = 30, seeds: int = 3, **changed: object) -> list[dict[in
     rng = np.random.default_rng(0)
     arrays = population.pair(rng, images, seeds, Population(skill=1.8, training_sd=0.1))
     return [
-        {seed: counts_of(array, **changed) for seed, array in enumerate(each)} for each in arrays
+        {seed: counts_of(array, **changed) for seed, array in enumerate(of_row)}
+        for of_row in arrays
     ]
 
 
@@ -49,23 +50,23 @@ def by_loop(terms: Sequence[Term], seeds: Sequence[int]) -> tuple[np.ndarray, fl
 
     def scored(images: np.ndarray) -> np.ndarray:
         total = np.zeros(len(seeds))
-        for each in terms:
+        for term in terms:
             for place, seed in enumerate(seeds):
-                counts = each.counts[FIXED if each.fixed else seed]
+                counts = term.counts[FIXED if term.fixed else seed]
                 drawn = replace(counts, counts=counts.counts * images[:, None, None, None])
-                total[place] += each.weight * value(each.metric, drawn, "released")
+                total[place] += term.weight * value(term.metric, drawn, "released")
         return total
 
     count = len(next(iter(terms[0].counts.values())).names)
     rng = numpy_generator(SETTINGS.seed, "bootstrap")
     draws = rng.multinomial(count, np.full(count, 1 / count), SETTINGS.resamples)
-    means = [scored(each).mean() for each in draws]
+    means = [scored(names).mean() for names in draws]
     return scored(np.ones(count, int)), float(np.std(means))
 
 
 def regions(rows: Sequence[Mapping[int, Counts]]) -> list[Term]:
     """The centre gains more than the edge."""
-    minus = [replace(each, weight=-each.weight) for each in difference(rows, "region/2")]
+    minus = [replace(term, weight=-term.weight) for term in difference(rows, "region/2")]
     return [*difference(rows, "region/1"), *minus]
 
 
@@ -93,12 +94,12 @@ def test_evidence_gives_the_interval_of_paired_comparisons(blocks) -> None:
     """Scenes of four neighbours, so that "auto" draws blocks."""
     rng = np.random.default_rng(2)
     arrays = Population(block=4).pair(rng, 60, 4, Population(skill=1.8, training_sd=0.1))
-    rows = [dict(enumerate(map(counts_of, each))) for each in arrays]
+    rows = [dict(enumerate(map(counts_of, of_row))) for of_row in arrays]
     settings = replace(SETTINGS, blocks=blocks)
     found = Resampler(settings).evidence(difference(rows, "Var"))
     wanted = estimate_of(found, settings.level)
     assert ("neighbouring frames" in found.said) == (blocks != "none")
-    verdict = decide([found], (0.0, math.inf), FixedSeeds(), "all")
+    verdict = decide([found], (0.0, math.inf), Rule(), "all")
     assert verdict.interval is not None
     assert (verdict.interval.low, verdict.interval.high, verdict.estimate) == pytest.approx(
         (wanted.interval.low, wanted.interval.high, wanted.value)
@@ -109,9 +110,9 @@ def test_evidence_of_the_night_gives_other_images_no_weight() -> None:
     """18 of 30 images by night: the draws are those of all images."""
     rows = rows_of(night=tuple(place % 5 < 3 for place in range(30)))
     terms = difference(rows, "night/mIoU")
-    for each in (terms, [*terms, *difference(rows, "mIoU")]):
-        found = Resampler(SETTINGS).evidence(each)
-        values, error = by_loop(each, (0, 1, 2))
+    for chosen in (terms, [*terms, *difference(rows, "mIoU")]):
+        found = Resampler(SETTINGS).evidence(chosen)
+        values, error = by_loop(chosen, (0, 1, 2))
         assert found.values == pytest.approx(values)
         assert found.error == pytest.approx(error * math.sqrt(18 / 17))
         assert (found.blocks, found.said) == (18, "18 of 30 single images")
@@ -121,8 +122,8 @@ def test_evidence_terms_may_have_other_regions() -> None:
     """The same predictions in one region and in two have the same mIoU on every draw."""
     row, _ = rows_of()
     whole = {
-        seed: remeasured(replace(each, counts=each.counts.sum(1, keepdims=True)), partition="ring1")
-        for seed, each in row.items()
+        seed: remeasured(replace(five, counts=five.counts.sum(1, keepdims=True)), partition="ring1")
+        for seed, five in row.items()
     }
     found = Resampler(SETTINGS).evidence([term(1.0, row, "two"), term(-1.0, whole, "one")])
     assert (found.values, found.error) == ((0.0, 0.0, 0.0), 0.0)
@@ -143,7 +144,7 @@ def test_evidence_uses_the_seeds_that_all_rows_have() -> None:
 def test_evidence_ignores_order_of_images_and_other_contrasts() -> None:
     rows = rows_of()
     names = np.random.default_rng(1).permutation(rows[0][0].names).tolist()
-    shuffled = [{seed: each.select(names) for seed, each in row.items()} for row in rows]
+    shuffled = [{seed: counts.select(names) for seed, counts in row.items()} for row in rows]
     settings = replace(SETTINGS, blocks="auto")
     plain = Resampler(settings).evidence(difference(rows))
     used = Resampler(settings)
@@ -181,7 +182,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
 
     apart = [{0: row[0]}, {1: other[1], 2: other[2]}]
     refused(difference(apart), "no seed in common: 1, 2 and 0. Train the same seeds")
-    emptied = {seed: replace(each, counts=each.counts * 0) for seed, each in row.items()}
+    emptied = {seed: replace(full, counts=full.counts * 0) for seed, full in row.items()}
     word = "'pixel_accuracy' of one of a/0, a/1, a/2 has nothing to score"
     refused([term(1.0, emptied, "a", "pixel_accuracy")], word)
     for keys, counts in (({0: "a"}, row), ({FIXED: "a", 1: "b"}, {FIXED: row[0], 1: row[1]})):

@@ -23,10 +23,10 @@ NAMES = ("A", "B", "A x B")
 
 
 def scores(values: object, drawn: object = None, images: int = 20) -> list[Evidence]:
-    """Evidence of each cell from (S, C) values and (resamples, C) draws of the images."""
+    """Evidence of effect cell from (S, C) values and (resamples, C) draws of the images."""
     array = np.array(values, float)
     draws = np.empty((0, array.shape[1])) if drawn is None else np.array(drawn, float)
-    errors = [over_images(each, images) for each in draws.T]
+    errors = [over_images(drawn, images) for drawn in draws.T]
     return [
         Evidence(
             values=tuple(array[:, cell].tolist()),
@@ -44,8 +44,8 @@ def test_effects_are_differences_of_halves() -> None:
     # Means of A are 9 and 2, of B 7.5 and 3.5. B adds 6 at A+ and 2 at A-: half of 4 is 2.
     cells = scores([[1, 3, 6, 12]])
     found = estimate_effects(cells, np.vstack([SIGNS, np.ones(4)]), "cells")
-    assert [each.estimate.value for each in found] == [7, 4, 2, 5.5]
-    assert all(each.estimate.both is None and not each.is_shown() for each in found)
+    assert [effect.value for effect in found] == [7, 4, 2, 5.5]
+    assert all(effect.both is None and not effect.is_shown() for effect in found)
     with pytest.raises(ValueError, match="balanced rows of 4"):
         estimate_effects(cells, np.array([[1.0, 1, 1, -1]]), "cells")
 
@@ -65,17 +65,17 @@ def test_effects_are_differences_of_halves() -> None:
 )
 def test_error_over_seeds_by_hand(values: object, noise: Noise, errors: list[float]) -> None:
     found = estimate_effects(scores(values), SIGNS, noise)
-    spreads = [each.estimate.evidence.trainings for each in found]
-    assert [each.error for each in spreads] == pytest.approx(errors)
-    assert {each.freedom for each in spreads} == {3 if noise == "cells" else 1}
+    spreads = [effect.evidence.trainings for effect in found]
+    assert [spread.error for spread in spreads] == pytest.approx(errors)
+    assert {spread.freedom for spread in spreads} == {3 if noise == "cells" else 1}
 
 
 def test_error_of_images_uses_joint_draws_of_all_cells() -> None:
     # On draws A is 1 and 3: standard deviation 1, times sqrt(20 / 19).
     drawn: list[list[float]] = [[5, 5, 6, 6], [7, 7, 10, 10]]
     found = estimate_effects(scores([[0, 0, 2, 2], [0, 0, 2, 2]], drawn), SIGNS, "cells")
-    assert found[0].estimate.evidence.error == pytest.approx(math.sqrt(20 / 19))
-    assert found[1].estimate.evidence.error == 0
+    assert found[0].evidence.error == pytest.approx(math.sqrt(20 / 19))
+    assert found[1].evidence.error == 0
 
 
 def test_combine_pairs_seeds_and_draws() -> None:
@@ -128,10 +128,8 @@ def test_intervals_cover_truth_and_rarely_show_null_effects(noise: Noise, seeds:
     rng, covered, shown = np.random.default_rng([5, seeds]), np.zeros(3), 0
     for _ in range(200):
         found = estimate_effects(normal_scores(rng, noise, seeds), SIGNS, noise)
-        covered += [
-            truth in each.estimate.both for truth, each in zip((2, 0, 0), found, strict=True)
-        ]
-        shown += any(each.is_shown() for each in found[1:])
+        covered += [truth in effect.both for truth, effect in zip((2, 0, 0), found, strict=True)]
+        shown += any(effect.is_shown() for effect in found[1:])
     # Standard error 1.5 %.
     assert (covered / 200 >= 0.9).all(), covered
     assert covered[0] / 200 <= 0.99

@@ -23,12 +23,12 @@ SETTINGS = Resampling(resamples=200, blocks="none")
 
 def drawn(images: int = 40, trainings: int = 1, seed: int = 0, **changes: Any) -> list[Counts]:
     array = Population(**changes).draw(np.random.default_rng(seed), images, trainings)
-    return [counts_of(each) for each in array]
+    return [counts_of(counts) for counts in array]
 
 
 def pair(other: Population, images: int = 60, trainings: int = 1) -> list[list[Counts]]:
     arrays = Population(training_sd=0.1).pair(np.random.default_rng(0), images, trainings, other)
-    return [[counts_of(each) for each in array] for array in arrays]
+    return [[counts_of(counts) for counts in array] for array in arrays]
 
 
 def looped(seeds: list[Counts], metric: str, absent: str = "released") -> np.ndarray:
@@ -38,7 +38,7 @@ def looped(seeds: list[Counts], metric: str, absent: str = "released") -> np.nda
     draws = rng.multinomial(count, np.full(count, 1 / count), SETTINGS.resamples)
     picked = ([n for n, w in zip(names, draw, strict=True) for _ in range(w)] for draw in draws)
     return np.array(
-        [np.mean([value(metric, each.select(names), absent) for each in seeds]) for names in picked]
+        [np.mean([value(metric, seed.select(names), absent) for seed in seeds]) for names in picked]
     )
 
 
@@ -76,10 +76,10 @@ def test_values_are_means_over_seeds_in_requested_order() -> None:
     seeds = drawn(trainings=3, training_sd=0.2)
     found = estimate(seeds, METRICS, SETTINGS)
     assert tuple(found) == METRICS
-    for metric, each in found.items():
-        assert each.value == pytest.approx(scores(seeds, metric).mean(), rel=1e-12)
-        assert each.sd == pytest.approx(scores(seeds, metric).std(ddof=1), rel=1e-9)
-        assert (each.seeds, each.evidence.said) == (3, "40 single images")
+    for metric, result in found.items():
+        assert result.value == pytest.approx(scores(seeds, metric).mean(), rel=1e-12)
+        assert result.sd == pytest.approx(scores(seeds, metric).std(ddof=1), rel=1e-9)
+        assert (result.seeds, result.evidence.said) == (3, "40 single images")
 
 
 def test_variance_interval_is_without_the_bias() -> None:
@@ -134,16 +134,18 @@ def test_nothing_to_score_is_nan() -> None:
     metrics = ["class/cone", "class/car", "class/car"]
     nothing, some = compare(*sides, metrics, settings).differences
     assert nothing.interval is None
-    assert all(map(math.isnan, (nothing.value, nothing.difference.p, nothing.p_corrected)))
-    assert some.p_corrected == some.difference.p
+    assert all(
+        map(math.isnan, (nothing.value, nothing.difference.p, nothing.difference.p_corrected))
+    )
+    assert some.difference.p_corrected == some.difference.p
 
 
 def test_night_is_scored_on_its_own_images() -> None:
     (counts,) = drawn()
     counts = replace(counts, night=tuple(place % 2 == 0 for place in range(40)))
     found = estimate([counts], ["night/mIoU", "mIoU", "day/mIoU"], SETTINGS)
-    for metric, each in found.items():
-        assert each.value == pytest.approx(value(metric, counts, "released"))
+    for metric, result in found.items():
+        assert result.value == pytest.approx(value(metric, counts, "released"))
     assert found["night/mIoU"].evidence.said == "20 of 40 single images"
 
 
@@ -156,7 +158,7 @@ def test_seeds_of_two_methods_are_not_paired() -> None:
     b = b[:6]
     (found,) = compare(a, b, ["mIoU"], SETTINGS).differences
     of_images = (looped(b, "mIoU") - looped(a, "mIoU")).std() * math.sqrt(40 / 39), 39
-    errors = [(scores(each).std(ddof=1) / math.sqrt(len(each)), len(each) - 1) for each in (a, b)]
+    errors = [(scores(side).std(ddof=1) / math.sqrt(len(side)), len(side) - 1) for side in (a, b)]
     of_seeds = welch(*errors)
     ways = (welch(of_images, of_seeds), of_seeds)
     half = max(stats.t.ppf(0.975, freedom) * error for error, freedom in ways)

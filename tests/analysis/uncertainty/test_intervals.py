@@ -59,7 +59,7 @@ def test_interval_of_absolute_differences_reaches_0_by_chance() -> None:
 def test_student_and_welch_are_scipys(sizes: tuple[int, ...]) -> None:
     rng = np.random.default_rng(sum(sizes))
     a, *others = (rng.normal(60 + place, 0.3 + place, size) for place, size in enumerate(sizes))
-    value = float(a.mean()) - sum(float(each.mean()) for each in others)
+    value = float(a.mean()) - sum(float(other.mean()) for other in others)
     theirs = stats.ttest_ind(a, *others, equal_var=False) if others else stats.ttest_1samp(a, 0.0)
     spread = over_seeds(a, *others)
     assert spread is not None

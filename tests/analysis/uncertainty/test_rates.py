@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 
 def as_counts(array: np.ndarray) -> list[Counts]:
-    return [counts_of(each) for each in array]
+    return [counts_of(counts) for counts in array]
 
 
 def true_values(population: Population) -> dict[str, float]:
@@ -33,7 +33,7 @@ def true_values(population: Population) -> dict[str, float]:
     draws = 60 if population.training_sd else 8
     trainings = [counts_of(population.draw(rng, 3000, 1)[0]) for _ in range(draws)]
     return {
-        metric: float(np.mean([value(metric, each, "released") for each in trainings]))
+        metric: float(np.mean([value(metric, training, "released") for training in trainings]))
         for metric in METRICS
     }
 
@@ -49,8 +49,8 @@ def coverage(
     names = tuple(f"{place + gap * (place // population.block):06d}D" for place in range(images))
     for number in range(RUNS):
         seeds = [
-            replace(each, names=names)
-            for each in as_counts(population.draw(rng, images, trainings))
+            replace(counts, names=names)
+            for counts in as_counts(population.draw(rng, images, trainings))
         ]
         found = estimate(seeds, METRICS, replace(settings, seed=number))
         for metric in METRICS:
@@ -121,9 +121,9 @@ def test_false_alarms(images: int, blocks, block: int, trainings: int, training_
         a, b = map(as_counts, population.pair(rng, images, trainings, population))
         settings = replace(SETTINGS, blocks=blocks, seed=number)
         found = compare(a, b, METRICS, settings).differences
-        for each in found:
-            raised[each.metric] += each.difference.p <= 0.05
-        any_of_all += any(each.p_corrected <= 0.05 for each in found)
+        for line in found:
+            raised[line.metric] += line.difference.p <= 0.05
+        any_of_all += any(line.difference.p_corrected <= 0.05 for line in found)
     rates = [count / RUNS for count in raised.values()]
     print(images, blocks, trainings, training_sd, rates, any_of_all / RUNS)
     assert max(rates) <= 0.1

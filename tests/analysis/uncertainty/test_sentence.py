@@ -65,7 +65,7 @@ def test_sentence(
     words: str,
 ) -> None:
     a, b, p, *ends = values
-    images, both = [*(Interval(*each) for each in ends), None, None][:2]
+    images, both = [*(Interval(*pair) for pair in ends), None, None][:2]
     difference = side(b - a, 1, said, images=images, both=both, p=p)
     sides = {"a": side(a, seeds[0]), "b": side(b, seeds[1])}
     found = Difference(metric=metric, difference=difference, **sides)

@@ -13,8 +13,6 @@ from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.intervals import Spread
 from analysis.uncertainty.verdicts import (
     ONE_START,
-    AnyTime,
-    FixedSeeds,
     Rule,
     Verdict,
     decide,
@@ -33,7 +31,7 @@ from tests.analysis.uncertainty.simulated_claims import (
 )
 
 HIGHER, LOWER = (0.0, math.inf), (-math.inf, 0.0)
-FIXED, ANY = FixedSeeds(), AnyTime()
+FIXED, ANY = Rule(), Rule(any_time=True)
 
 
 def evidence(*values: float, error: float = 0.1, blocks: int = 40) -> Evidence:
@@ -214,7 +212,7 @@ def test_error_rates_of_rule_stopping_at_any_time() -> None:
 
 
 def test_rates_of_looking_at_fixed_intervals_after_every_seed() -> None:
-    """Why `until_decided` needs `AnyTime`: a true difference of 0 is decided far too often."""
+    """Why `until_decided` is valid `any_time`: else a difference of 0 is decided far too often."""
     looked = rates(60, 0.0, 0.0, until_decided, FIXED)
     assert looked.holds + looked.contradicted > 2 * BOUND
     once = rates(100, 0.0, 0.3, with_seeds(5), FIXED)
@@ -251,7 +249,7 @@ def test_rates_of_seeds_far_from_normal(seeds: int, wrong: float) -> None:
     """Lognormal scores, whose mean is sqrt(e)."""
     rates = simulated(lambda rng, n: rng.lognormal(0, 1, n) - math.exp(0.5), seeds)
     assert sum(rates) == pytest.approx(wrong, abs=0.03)
-    assert "14 to 18 %" in " ".join(str(FixedSeeds.__doc__).split())
+    assert "14 to 18 %" in " ".join(str(Rule.__doc__).split())
 
 
 def test_rates_of_one_start() -> None:
@@ -310,8 +308,8 @@ def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
     naive = stats.t.ppf(0.975, np.arange(1, 200)) / np.sqrt(np.arange(2, 201))
     drawn = [running(rng, 200) for _ in range(1500)]
     missed, fixed = (
-        np.mean([(np.abs(means) > sds * each).any() for means, sds in drawn])
-        for each in (factors, naive)
+        np.mean([(np.abs(means) > sds * factor).any() for means, sds in drawn])
+        for factor in (factors, naive)
     )
     assert 0.01 < missed < 0.05
     assert fixed > 0.3
@@ -319,7 +317,7 @@ def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
 
 @pytest.mark.parametrize("ratio", [0.0, 0.2, 3.0])
 def test_images_and_seeds_miss_in_less_than_alpha(ratio: float) -> None:
-    """`AnyTime` joins squares at half of the error rate each; the whole rate is too much."""
+    """`Rule.any_time` joins squares at half of the error rate; the whole rate is too much."""
     missed = ever_missed(1500, 200, ratio)
     assert missed["squares, half"] < 0.05
     assert missed["sum, half"] <= missed["squares, half"] <= missed["squares, whole"]

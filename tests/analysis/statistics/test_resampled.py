@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.statistics.collect import MeasurementSettings, collect
-from analysis.statistics.sample import (
+from analysis.statistics.collect import collect
+from analysis.statistics.resampled import (
     EPSILON,
-    Sample,
+    ResampledSplit,
     normalised,
     occupancy_map,
     quantities,
@@ -20,7 +20,7 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.intervals import student
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
-from rgbt.types import Sample as Image
+from rgbt.types import Sample
 from tests.analysis.statistics.scenes import InMemory, made
 
 HW = (60, 80)
@@ -39,13 +39,13 @@ def test_planted_occupancy_is_found() -> None:
             inside = np.flatnonzero(region_map == r)
             label.ravel()[rng.permutation(inside)[: round(share * len(inside))]] = 1
         blank = np.zeros((*HW, 3), np.uint8)
-        samples.append(Image(blank, blank[..., 0], label, f"{n:05d}D"))
-    stats = collect(InMemory(samples), "train", MeasurementSettings(regions=RINGS))
-    found = Sample(stats).occupancy()[0]
+        samples.append(Sample(blank, blank[..., 0], label, f"{n:05d}D"))
+    stats = collect(InMemory(samples), "train", RINGS)
+    found = ResampledSplit(stats).occupancy()[0]
     np.testing.assert_allclose(found, shares, atol=1e-3)
     map_ = occupancy_map(stats)
     np.testing.assert_allclose(found, [map_[region_map == r].mean() for r in range(4)])
-    relative = normalised(Sample(stats).classes()[0])
+    relative = normalised(ResampledSplit(stats).classes()[0])
     np.testing.assert_allclose(relative[1], [1, 0.6, 0.4, 0.1], atol=2e-3)
     assert np.isnan(relative[2]).all()
 
@@ -55,7 +55,7 @@ def test_occupancy_leaves_out_the_stated_background() -> None:
     labels[:, 0] = 60, 10, 20, 10  # 70 of 100 pixels of region 1 are no background
     labels[:, 1] = 10, 0, 5, 5  # 10 of 20 of region 2
     plain = made(images=2, regions=2, classes=ROAD_FIRST, background=("other", "void"))
-    sample = Sample(replace(plain, labels=labels))
+    sample = ResampledSplit(replace(plain, labels=labels))
     np.testing.assert_allclose(sample.occupancy()[0], [0.7, 0.5])
     # Without background: 6/7 and 1/7, then road alone.
     bits = -(6 / 7 * math.log2(6 / 7) + 1 / 7 * math.log2(1 / 7))
@@ -72,16 +72,16 @@ def test_an_ignored_pixel_is_no_background() -> None:
     labels = [[[255, 0], [1, 255]], [[1, 0], [1, 255]], [[0, 2], [0, 255]]]
     blank = np.zeros((2, 2, 3), np.uint8)
     samples = [
-        Image(blank, blank[..., 0], np.array(label, np.uint8), f"{n}D")
+        Sample(blank, blank[..., 0], np.array(label, np.uint8), f"{n}D")
         for n, label in enumerate(labels)
     ]
     strips = Regions(partition="vertical", regions=2, aspect=None, absent="released")
-    stats = collect(InMemory(samples), "train", MeasurementSettings(regions=strips))
+    stats = collect(InMemory(samples), "train", strips)
     map_ = occupancy_map(stats)
     np.testing.assert_allclose(map_, [[1 / 2, 1 / 3], [2 / 3, np.nan]])
     # Left column: 5 valid pixels, 3 of class 1. Right column: 3 valid pixels, 1 of class 2.
-    np.testing.assert_allclose(Sample(stats).occupancy()[0], [3 / 5, 1 / 3])
-    by_class = Sample(stats).classes()[0]
+    np.testing.assert_allclose(ResampledSplit(stats).occupancy()[0], [3 / 5, 1 / 3])
+    by_class = ResampledSplit(stats).classes()[0]
     np.testing.assert_allclose(by_class[1:3], [[3 / 5, 0], [0, 1 / 3]])
     assert stats.ignored.sum(0).tolist() == [1, 3]
 
@@ -92,7 +92,7 @@ def test_entropy_by_hand() -> None:
     labels[1, 1] = 0, 4, 4, 8  # the second image: 1.5 bits, either way
     labels[1, 0] = 2, 1, 1, 0
     labels[0, 2] = 9, 0, 0, 0  # background alone: 0 bits, and nothing without it
-    sample = Sample(made(images=2, labels=labels))
+    sample = ResampledSplit(made(images=2, labels=labels))
     np.testing.assert_allclose(sample.entropy()[0], [1.5, 1.5, 0])
     np.testing.assert_allclose(sample.entropy(background=False)[0], [1, 1.5, np.nan])
 
@@ -101,18 +101,18 @@ def test_averages_of_ratios_by_hand() -> None:
     """Day: mean 100 over noise 2; night: mean 20 over noise 4. Thermal as given."""
     mean, noise = np.full((2, 2, 3), 100.0), np.full((2, 2, 3), 2.0)
     mean[1, 0], noise[1, 0] = 20, 4
-    sample = Sample(made(images=2, mean=mean, noise=noise))
+    sample = ResampledSplit(made(images=2, mean=mean, noise=noise))
     np.testing.assert_allclose(sample.snr()[0, 0], 120 / 6, rtol=1e-6)
     images = sample.snr(way=("std", "images"))
     np.testing.assert_allclose(images[0, 0], (50 + 5) / 2, rtol=1e-6)
     np.testing.assert_allclose(sample.snr("night")[0, 0], 5, rtol=1e-6)
     np.testing.assert_allclose(sample.snr()[0, 1], 50, rtol=1e-6)
     np.testing.assert_allclose(sample.noise()[0, 0], 3)
-    flat = Sample(made(images=2, noise=np.zeros((2, 2, 3))))
+    flat = ResampledSplit(made(images=2, noise=np.zeros((2, 2, 3))))
     np.testing.assert_allclose(flat.snr(), 100 / EPSILON)  # no division by zero
     for wrong in (("mad", "pooled"), ("std", "median")):
         with pytest.raises(InputError, match="is not a valid choice"):
-            Sample(made(), None, wrong)
+            ResampledSplit(made(), None, wrong)
 
 
 def test_quantities_are_one_tidy_frame() -> None:
@@ -129,7 +129,7 @@ def test_quantities_are_one_tidy_frame() -> None:
 
 def test_a_mean_gets_the_t_interval_of_its_blocks() -> None:
     values = np.random.default_rng(0).normal(size=100)
-    sample = Sample(made(images=100, night=False), Resampling(resamples=20_000, blocks=10))
+    sample = ResampledSplit(made(images=100, night=False), Resampling(resamples=20_000, blocks=10))
     found = sample.evidence(sample.mean(values))
     means = values.reshape(10, 10).mean(1)
     assert found.values[0] == pytest.approx(values.mean())
@@ -140,7 +140,7 @@ def test_a_mean_gets_the_t_interval_of_its_blocks() -> None:
 
 def test_freedom_is_blocks_less_strata() -> None:
     """Day and night of 6 blocks each: 12 - 2 degrees; the smaller stratum enlarges."""
-    sample = Sample(made(images=60), Resampling(resamples=100, blocks=5))
+    sample = ResampledSplit(made(images=60), Resampling(resamples=100, blocks=5))
     values = np.array([10.0, 9.0, 11.0, 9.0, 11.0])  # a standard error of 1
     for part, freedom in (("all", 10), ("day", 5)):
         found = sample.evidence(values, part)
@@ -149,7 +149,7 @@ def test_freedom_is_blocks_less_strata() -> None:
 
 
 def test_blocks_of_day_and_night_are_drawn_apart() -> None:
-    sample = Sample(made(images=100), TENS)
+    sample = ResampledSplit(made(images=100), TENS)
     is_night = np.arange(100) >= 50
     for block in range(sample.blocks.count):
         assert len(set(is_night[sample.blocks.index == block])) == 1
@@ -157,12 +157,12 @@ def test_blocks_of_day_and_night_are_drawn_apart() -> None:
     np.testing.assert_allclose(sample.mean(is_night.astype(float)), 0.5)  # each keeps its number
     assert sample.mean(np.arange(100.0))[0] == pytest.approx(49.5)
     with pytest.raises(InputError, match="part=night: split 'train' of made states no such image"):
-        Sample(made(night=False)).mean(np.arange(40.0), "night")
+        ResampledSplit(made(night=False)).mean(np.arange(40.0), "night")
 
 
 @pytest.mark.parametrize(("blocks", "known"), [(5, True), (4, False)])
 def test_few_blocks_of_what_is_measured_give_no_interval(blocks: int, known: bool) -> None:
-    sample = Sample(made(images=120), TENS)
+    sample = ResampledSplit(made(images=120), TENS)
     present = np.arange(120) < 10 * blocks
     found = sample.evidence(sample.mean(np.arange(120.0)), "all", present)
     assert (found.images is not None, found.blocks) == (known, 11 if known else 4)
@@ -179,7 +179,7 @@ def test_intervals_cover_the_true_value() -> None:
         values = np.exp(0.4 * scene + 0.2 * rng.normal(size=100))
         for size in inside:
             drawn = Resampling(resamples=400, blocks=size, seed=int(rng.integers(2**31)))
-            sample = Sample(made(images=100), drawn)
+            sample = ResampledSplit(made(images=100), drawn)
             ratio = sample.mean(values, "day") / sample.mean(values, "night")
             _, low, high = sample.bounded(ratio)
             inside[size] += low <= 1 <= high

@@ -1,4 +1,4 @@
-"""Quantities of a split by region, of the split as it is and with its images drawn anew."""
+"""Quantities of a split by region, of the split as it is and with its images resampled."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COLUMNS = ["quantity", "modality", "class", "estimator", "average"]
 Values = NDArray[np.float64]
 
 
-class Sample:
+class ResampledSplit:
     """The images of a split, and B resamples of them: blocks within day and within night.
 
     Args:
@@ -72,14 +72,14 @@ class Sample:
         self._is_night = np.zeros(self.blocks.count, bool)
         self._is_night[self.blocks.index] = night
 
-    def by(self, way: tuple[str, str]) -> Sample:
-        """The same draws, with another estimator and average of the noise."""
+    def by(self, way: tuple[str, str]) -> ResampledSplit:
+        """Return the same draws, with another estimator and average of the noise."""
         other = copy(self)
         other.way = way
         return other
 
     def mean(self, values: NDArray[np.number], part: str = ALL) -> Values:
-        """(1 + B, ...), mean of (N, ...) over the images of "all", "day" or "night"."""
+        """Average (N, ...) over the images of "all", "day" or "night" to (1 + B, ...)."""
         self.stats.chosen(part)
         used = self._is_night == (part == NIGHT) if part != ALL else slice(None)
         weights = self._weights[:, used]
@@ -88,7 +88,7 @@ class Sample:
         return np.asarray(totals / images.reshape(-1, *[1] * (values.ndim - 1)))
 
     def occupancy(self, part: str = ALL) -> Values:
-        """(1 + B, R), share of the valid pixels that is of no background class (Eq. 2).
+        """Return (1 + B, R), the share of valid pixels of no background class (Eq. 2).
 
         Raises:
             InputError: the data set has no background class.
@@ -97,12 +97,12 @@ class Sample:
         return occupancy_of(self.mean(self.stats.labels, part), self.stats.is_background)
 
     def classes(self, part: str = ALL) -> Values:
-        """(1 + B, K, R), share of every class among the valid pixels."""
+        """Return (1 + B, K, R), the share of every class among the valid pixels."""
         labels = self.mean(self.stats.labels, part)
         return np.swapaxes(_ratio(labels, labels.sum(-1, keepdims=True)), -1, -2)
 
     def entropy(self, part: str = ALL, *, background: bool = True) -> Values:
-        """(1 + B, R), Shannon entropy of the classes of all pixels in bits; NaN without a pixel.
+        """Return (1 + B, R), the Shannon entropy of the classes in bits; NaN without a pixel.
 
         Source: SpatialSeg, Eq. 5 and Sec. III-C.1, applied to the label inside a region. Without
         the background classes the shares are those among the other classes.
@@ -114,15 +114,15 @@ class Sample:
         return np.asarray(np.abs((share * np.log2(np.where(share == 0, 1.0, share))).sum(-1)))
 
     def laplacian(self, part: str = ALL) -> Values:
-        """(1 + B, 2, R), Laplacian variance (Eq. 3) in squared grey levels."""
+        """Return (1 + B, 2, R), the Laplacian variance (Eq. 3) in squared grey levels."""
         return self.mean(self.stats.laplacian, part)
 
     def noise(self, part: str = ALL, estimator: str = "") -> Values:
-        """(1 + B, 2, R), standard deviation of the noise in grey levels."""
+        """Return (1 + B, 2, R), the standard deviation of the noise in grey levels."""
         return self.mean(self.stats.noise[:, ESTIMATORS.index(estimator or self.way[0])], part)
 
     def snr(self, part: str = ALL, way: tuple[str, str] | None = None) -> Values:
-        """(1 + B, 2, R), signal-to-noise ratio: mean grey level over noise (Eq. 4)."""
+        """Return (1 + B, 2, R), the signal-to-noise ratio: mean grey level over noise (Eq. 4)."""
         estimator, average = way or self.way
         signal, noise = self.stats.mean, self.stats.noise[:, ESTIMATORS.index(estimator)]
         if average == "pooled":
@@ -132,7 +132,7 @@ class Sample:
     def evidence(
         self, values: Values, part: str = ALL, present: NDArray[np.bool_] | None = None
     ) -> Evidence:
-        """What the split says about one number, (1 + B,) of `part`.
+        """Return what the split says about one number, (1 + B,) of `part`.
 
         `present`: the images (N,) that say anything about it. There is no interval with fewer than
         `LEAST` blocks of them, or of day or night. A resample without a rare class has no value.
@@ -152,7 +152,7 @@ class Sample:
         )
 
     def bounded(self, values: Values, part: str = ALL) -> tuple[float, float, float]:
-        """Value and interval of a positive number, on the logarithmic scale; NaN: no interval."""
+        """Return a positive number and its interval on the logarithmic scale; NaN: no interval."""
         with np.errstate(divide="ignore", invalid="ignore"):
             found = self.evidence(np.log(values), part)
         if found.images is None or self.settings is None:
@@ -162,12 +162,12 @@ class Sample:
 
 
 def occupancy_of(labels: NDArray[np.number], is_background: NDArray[np.bool_]) -> Values:
-    """(..., R, K) pixels -> (..., R) share that is of no background class, marked in (K,)."""
+    """Return (..., R), the share of (..., R, K) pixels that is of no background class (K,)."""
     return _ratio(labels[..., ~is_background].sum(-1), labels.sum(-1))
 
 
 def occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Values:
-    """(H, W), share of images with a class that is no background (SpatialSeg, Eq. 1); 0..1.
+    """Return (H, W), the share of images without background (SpatialSeg, Eq. 1); 0..1.
 
     An ignored pixel is no background: a pixel's share is among the images that have a valid label
     there, NaN where none has. The paper divides by all masks, which is the same where nothing is
@@ -178,7 +178,7 @@ def occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Values:
 
 
 def normalised(occupancy: Values) -> Values:
-    """(..., K, R), each class relative to the region where it is most frequent (Fig. 3).
+    """Divide each class of (..., K, R) by the region where it is most frequent (Fig. 3).
 
     0..1 with a 1 in every row; NaN for a class that does not occur.
     """
@@ -186,10 +186,10 @@ def normalised(occupancy: Values) -> Values:
 
 
 def entropies(stats: SpatialStatistics) -> tuple[tuple[str, bool], ...]:
-    """The label entropies of a data set: a word for each, and whether the background counts."""
+    """Name the label entropies of a data set, and say whether the background counts."""
     if not stats.background:
         return (("label entropy", True),)
-    return tuple((f"label entropy {w} background", w == "with") for w in ("with", "without"))
+    return ("label entropy with background", True), ("label entropy without background", False)
 
 
 def check_background(stats: SpatialStatistics) -> None:
@@ -199,7 +199,7 @@ def check_background(stats: SpatialStatistics) -> None:
 
 
 def no_background(stats: SpatialStatistics) -> str:
-    """Why a data set without a background class has no sample occupancy, in one sentence."""
+    """Say why a data set without a background class has no sample occupancy."""
     return (
         f"Sample occupancy is not available: no class of {stats.dataset} is stated as background. "
         "If one is, set dataset.background=[...] and measure again."
@@ -207,21 +207,22 @@ def no_background(stats: SpatialStatistics) -> str:
 
 
 def quantities(stats: SpatialStatistics) -> pd.DataFrame:
-    """All quantities by part of the images and region, one value a row.
+    """Compute all quantities by part of the images and region, one value a row.
 
     Columns: dataset, split, partition, images, part, `COLUMNS`, region (from 1), value. Shares are
     0..1, noise is in grey levels, Laplacian variance in squared grey levels, entropy in bits.
     """
-    sample, rows = Sample(stats), []
+    sample, rows = ResampledSplit(stats), []
     for part in stats.subsets():
         about = (stats.dataset, stats.split, stats.partition, int(stats.chosen(part).sum()), part)
         for keys, values in _of_part(sample, part):
-            rows += [(*about, *keys, region, v) for region, v in enumerate(values.tolist(), 1)]
+            for region, value in enumerate(values.tolist(), 1):
+                rows.append((*about, *keys, region, value))
     names = ["dataset", "split", "partition", "images", "part", *COLUMNS, "region", "value"]
     return pd.DataFrame(rows, columns=names)
 
 
-def _of_part(sample: Sample, part: str) -> Iterator[tuple[tuple[str, ...], Values]]:
+def _of_part(sample: ResampledSplit, part: str) -> Iterator[tuple[tuple[str, ...], Values]]:
     stats = sample.stats
     if stats.background:
         yield ("occupancy", "", "", "", ""), sample.occupancy(part)[0]
@@ -240,6 +241,6 @@ def _of_part(sample: Sample, part: str) -> Iterator[tuple[tuple[str, ...], Value
 
 
 def _ratio(above: NDArray[np.number], below: NDArray[np.number]) -> Values:
-    """Quotient that is NaN, without a warning, where nothing was counted."""
+    """Divide; NaN, without a warning, where nothing was counted."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(above / below, np.float64)
