@@ -175,9 +175,10 @@ class DeepLabV2(Network):
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
         layer3, layer4 = self.backbone(images.rgb if view == "rgb" else as_rgb(images.thermal))
-        head_parts, drop_rates = self.heads[name], self.dropout if self.training else (0.0, 0.0)
-        scores = enlarge(head_parts["aspp"](layer4), head_parts["ups"], drop_rates, generator)
-        logits = self._at_size(head_parts["final"](scores), images.rgb)
+        aspp, ups, final = self.heads[name].children()
+        drop_rates = self.dropout if self.training else (0.0, 0.0)
+        scores = final(enlarge(aspp(layer4), ups.children(), drop_rates, generator))
+        logits = self._at_size(scores, images.rgb)
         aux = {"features": layer4}
         if self.auxiliary is not None:
             aux["aux_logits"] = self._at_size(self.auxiliary(layer3), images.rgb)

@@ -63,7 +63,7 @@ class SemsegPSPNet(Network):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        self.ppm = nn.ModuleDict({"features": nn.ModuleList()})
+        branches = nn.ModuleList()
         for bins in BINS:
             branch = nn.Sequential(
                 nn.AdaptiveAvgPool2d(bins),
@@ -71,7 +71,8 @@ class SemsegPSPNet(Network):
                 nn.BatchNorm2d(8 * width),
                 nn.ReLU(),
             )
-            self.ppm["features"].append(branch)
+            branches.append(branch)
+        self.ppm = nn.ModuleDict({"features": branches})
         self.cls = _head(64 * width, 8 * width, num_classes)
         self.aux = _head(16 * width, 4 * width, num_classes)
         self.inputs = inputs

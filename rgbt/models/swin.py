@@ -199,7 +199,8 @@ class Swin(nn.Module):
         patches = image.view(n, c, height // PATCH, PATCH, width // PATCH, PATCH)
         patches = patches.permute(0, 2, 4, 1, 3, 5).flatten(3)
         proj, norm = self.patch_embed.children()
-        x = norm(F.linear(patches, proj.get_parameter("weight").flatten(1), proj.bias))
+        weight, bias = proj.get_parameter("weight"), proj.get_parameter("bias")
+        x = norm(F.linear(patches, weight.flatten(1), bias))
         if hidden is not None:
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
         rates = None

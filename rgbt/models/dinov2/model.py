@@ -87,8 +87,9 @@ class DinoBackbone(nn.Module):
             self.pyramids[modality] = nn.ModuleList(
                 pyramid_level(dim, token_px=token_px, stride=stride) for stride in STRIDES
             )
-        widths = [level[-1].normalized_shape[0] for level in self.pyramids["rgb"].children()]
-        self.norm_layers = Fusion((widths[0], widths[1], widths[2], widths[3]), fusion)
+        # The width of a level: see `pyramid_level`.
+        first, second, third, last = (dim * min(stride, token_px) // token_px for stride in STRIDES)
+        self.norm_layers = Fusion((first, second, third, last), fusion)
 
     def maps(self, modality: str, image: Tensor, hidden: Tensor | None, _: object) -> Maps:
         """Return maps of four strides, (N, C_s, H/s, W/s), of (N, c, H, W) and (N, h, w).
@@ -107,7 +108,7 @@ class DinoBackbone(nn.Module):
             added=self.thermal_embedding if modality == "thermal" else None,
             lora=self.lora[owner] if len(self.lora) else None,
         )
-        levels = self.pyramids[modality]
+        levels = list(self.pyramids[modality].children())
         sources = tokens if len(tokens) > 1 else tokens * len(levels)
         return [level(source) for level, source in zip(levels, sources, strict=True)]
 
