@@ -86,12 +86,12 @@ def damage(dataset: MFNet, *names: str) -> None:
 
 def assert_equal(found: Iterable[Any], expected: Iterable[Any]) -> None:
     for one, other in zip(found, expected, strict=True):
-        for each in dataclasses.fields(one):
-            a, b = getattr(one, each.name), getattr(other, each.name)
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
             if dataclasses.is_dataclass(a):
                 assert_equal([a], [b])
             else:
-                assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
+                assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, field.name
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -246,7 +246,7 @@ def test_more_workers_than_cores_are_no_warning(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     next(trained(dataset, range(1), num_workers=2))
-    assert not [each for each in recwarn if "worker" in str(each.message)]
+    assert not [warning for warning in recwarn if "worker" in str(warning.message)]
 
 
 def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,7 +278,7 @@ def test_batches_are_prefetched_and_pinned(
     locked: list[torch.Tensor] = []  # pages are locked on machines with a GPU alone
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: locked.append(self) or self)
     LoadedBatch(batch).pin_memory()
-    assert len(locked) == sum(isinstance(each, torch.Tensor) for each in vars(batch).values())
+    assert len(locked) == sum(isinstance(value, torch.Tensor) for value in vars(batch).values())
     assert LoadedBatch(error="why").pin_memory().error == "why"
 
 

@@ -116,7 +116,7 @@ def second(
             query, key = q[:, head], k[:, head]
             if positions is None:
                 periods = state["rope_embed.periods"]
-                query, key = (turned(each, hw, first, periods) for each in (query, key))
+                query, key = (turned(part, hw, first, periods) for part in (query, key))
             parts.append((query @ key.T / len(head) ** 0.5).softmax(1) @ v[:, head])
         x = x + state[f"{at}.ls1.gamma"] * linear(f"{at}.attn.proj", torch.cat(parts, 1))
         y = normed(f"{at}.norm2", x)
