@@ -46,7 +46,7 @@ Severities = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Corruption:
-    """Severities between two bounds, in a unit ("" of a single one); own classes may be others."""
+    """Checks severities by two bounds in a unit ("" of a single one); own classes need not."""
 
     severities: Severities
     name: ClassVar[str]
@@ -59,16 +59,16 @@ class Corruption:
 
     @property
     def title(self) -> str:
-        """Name in tables and figures, e.g. "noise, RGB"."""
+        """Return the name in tables and figures, e.g. "noise, RGB"."""
         return self.name
 
     def check(self, severity: float) -> None:
-        """InputError for a severity (> 0) out of the bounds."""
+        """Refuse (InputError) a severity (> 0) out of the bounds."""
         unit = f" ({self.unit})" if self.unit else ""
         check_range(f"severity{unit}", severity, *self.bounds)
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
-        """The corrupted `sample`, uint8 as before; the label and the name stay.
+        """Corrupt `sample`, uint8 as before; the label and the name stay.
 
         InputError where the severity changes nothing of an image of this size.
         """
@@ -77,15 +77,15 @@ class Corruption:
 
 @runtime_checkable
 class OfTime(Protocol):
-    """A corruption that shows the thermal image of another frame."""
+    """Shows the thermal image of another frame."""
 
     def shown(self, index: int, severity: float) -> int:
-        """Index of the frame whose thermal image is shown at `index`; 0 is the first frame."""
+        """Return the frame whose thermal image is shown at `index`; 0 is the first frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Pixels(Corruption):
-    """A corruption of RGB, of thermal, or of both (`image`)."""
+    """Corrupts RGB, thermal, or both (`image`)."""
 
     image: Images
 
@@ -106,7 +106,7 @@ class _Pixels(Corruption):
 
 @dataclass(frozen=True, kw_only=True)
 class Occluded(_Pixels):
-    """A share of the square blocks of the image is black (0, see `Removed`).
+    """Blackens a share of the square blocks of the image (0, see `Removed`).
 
     The blocks lie on a grid from the top left; those at the right and at the bottom may be cut.
     Exactly the nearest whole number to ``share x blocks`` is hidden, drawn without replacement, the
@@ -126,7 +126,7 @@ class Occluded(_Pixels):
     def hidden(
         self, image_hw: tuple[int, ...], share: float, rng: np.random.Generator
     ) -> NDArray[np.bool_]:
-        """(H, W): which pixels are hidden; those of a smaller share and more."""
+        """Draw which pixels are hidden, (H, W); those of a smaller share and more."""
         height, width = image_hw
         side = max(1, nearest_whole(at_height(self.block, height)))
         rows, columns = -(-height // side), -(-width // side)
@@ -141,7 +141,7 @@ class Occluded(_Pixels):
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(_Pixels):
-    """Gaussian noise on every pixel and channel, independent, rounded and cut at 0 and 255."""
+    """Adds Gaussian noise to every pixel and channel, independent, rounded, cut at 0 and 255."""
 
     name, unit, bounds = "noise, {}", "grey levels (std)", (0, 255)
 
@@ -152,7 +152,7 @@ class Noise(_Pixels):
 
 @dataclass(frozen=True, kw_only=True)
 class Blur(_Pixels):
-    """Gaussian blur; the image is mirrored at its edges."""
+    """Blurs by a Gaussian; the image is mirrored at its edges."""
 
     name, unit, bounds = "blur, {}", "pixels at 480 rows (sigma)", (0, REFERENCE_HEIGHT / 4)
 
@@ -164,7 +164,7 @@ class Blur(_Pixels):
 
 @dataclass(frozen=True, kw_only=True)
 class Removed(_Pixels):
-    """One image of the pair is black: every pixel 0 in the file's grey levels.
+    """Blackens one image of the pair: every pixel is 0 in the file's grey levels.
 
     That is before the normalisation: what a network sees depends on ``conf/model/inputs/``, from
     -2.12 (``crm``) to 0 (``unit``). Masked cells of a training become a learned token instead.
@@ -183,7 +183,7 @@ class Removed(_Pixels):
 
 @dataclass(frozen=True, kw_only=True)
 class Misregistered(Corruption):
-    """Thermal is moved by n pixels up, down, left or right, as drawn for each image.
+    """Moves thermal by n pixels up, down, left or right, as drawn for each image.
 
     Whole pixels, so that nothing is interpolated. What comes in from outside repeats the edge: a
     black stripe would be a corruption of its own.
@@ -204,46 +204,45 @@ class Misregistered(Corruption):
 
 @dataclass(frozen=True, kw_only=True)
 class Delayed(Corruption):
-    """The thermal image is that of n frames earlier; the first n frames show the first one."""
+    """Shows the thermal image of n frames earlier; the first n frames show the first one."""
 
     name, unit, bounds = "delayed thermal", "frames", (1, 1000)
 
     def check(self, severity: float) -> None:
-        """InputError but for whole frames."""
+        """Refuse (InputError) all but whole frames."""
         super().check(severity)
         if not severity.is_integer():
             raise InputError(f"severity: expected a number of frames, got {severity:g}.")
 
     def shown(self, index: int, severity: float) -> int:
-        """Index of the frame whose thermal image is shown at `index`."""
+        """Return the frame whose thermal image is shown at `index`."""
         return max(0, index - int(severity))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frozen(Delayed):
-    """The thermal image stands still and is renewed every n frames, by frames n, 2 n, 3 n, ..."""
+    """Shows one thermal image for n frames: that of frame n, 2 n, 3 n, ..."""
 
     name, unit, bounds = "frozen thermal", "frames between two images", (2, 1000)
 
     def shown(self, index: int, severity: float) -> int:
-        """Index of the frame whose thermal image is shown at `index`."""
+        """Return the frame whose thermal image is shown at `index`."""
         return index - index % int(severity)
 
 
 def at_height(pixels: float, height: int) -> float:
-    """A length of the reference height as a length of an image of `height` rows."""
+    """Scale a length of the reference height to an image of `height` rows."""
     return pixels * height / REFERENCE_HEIGHT
 
 
 def nearest_whole(value: float) -> int:
-    """The nearest whole number; halves go up."""
+    """Round to the nearest whole number; halves go up."""
     return math.floor(value + 0.5)
 
 
 def moved(image: Pixels, down: int, right: int) -> Pixels:
-    """(H, W) `image` moved by whole pixels (negative: up, left); the edge is repeated."""
-    rows, columns = (
-        (np.arange(size) - by).clip(0, size - 1)
-        for size, by in zip(image.shape, (down, right), strict=True)
-    )
+    """Move `image` (H, W) by whole pixels (negative: up, left); the edge is repeated."""
+    height, width = image.shape
+    rows = (np.arange(height) - down).clip(0, height - 1)
+    columns = (np.arange(width) - right).clip(0, width - 1)
     return np.asarray(image[np.ix_(rows, columns)])

@@ -22,12 +22,12 @@ from rgbt.types import Sample
 
 @lru_cache(maxsize=4096)
 def opened(path: Path) -> NDArray[np.uint8]:
-    """The planes of a file, (4 or 5, H, W); mapped once, as mapping costs as much as a crop."""
+    """Map the planes of a file, (4 or 5, H, W), once, as mapping costs as much as a crop."""
     return np.asarray(np.load(path, mmap_mode="r"))
 
 
 class CachedDataset(DatasetWrapper):
-    """A data set whose samples are decoded once and then read from files of `folder`.
+    """Decodes samples of a data set once, and then reads them from files of `folder`.
 
     The name of a file is a hash of the sample, the settings of its decoding, and path, length and
     times of its files, so that a changed file is decoded again. Files of former states are kept.
@@ -42,7 +42,7 @@ class CachedDataset(DatasetWrapper):
         self._settings = json.dumps(settings, default=str)
 
     def read(self, name: str) -> Sample:
-        """The sample as `source.read` returns it; its images are read-only views of the file.
+        """Read the sample as `source.read` does; its images are read-only views of the file.
 
         InputError: that of `source.read`, or the file cannot be written.
         """
@@ -59,7 +59,7 @@ class CachedDataset(DatasetWrapper):
         return Sample(rgb=rgb, thermal=images[3], label=label, name=name)
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone, (H, W); None if the pair is unlabelled."""
+        """Return the label of `read` alone, (H, W); None if the pair is unlabelled."""
         return self.read(name).label
 
     def _path(self, name: str) -> Path:

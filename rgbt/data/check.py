@@ -40,7 +40,7 @@ OF_FILE = re.compile(r"'([^']+)'|(\S*/\S+)")
 
 @dataclass(frozen=True)
 class SplitReport:
-    """One split: numbers of names by kind, and what is in its images.
+    """Holds numbers of names of a split by kind, and what is in its images.
 
     `read` and `unlabelled` count each name once; `day` and `night` leave out mirrored copies.
     `sizes` has the number of images of each (height, width); `pixels` and `images` (K + 1,) the
@@ -59,7 +59,7 @@ class SplitReport:
 
 
 class Content(NamedTuple):
-    """What the files of a sample hold; `pixels` as of `label_pixels`, None without a label."""
+    """Says what the files of a sample hold; `pixels` as of `label_pixels`, None without a label."""
 
     hw: tuple[int, ...]
     pixels: PixelCounts | None
@@ -70,7 +70,7 @@ class Content(NamedTuple):
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """A data set: its splits by name, and one sentence for each kind of problem and of note."""
+    """Holds the splits of a data set by name, and a sentence for each kind of problem and note."""
 
     splits: dict[str, SplitReport]
     problems: tuple[str, ...]
@@ -90,15 +90,15 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
     print_rich(plain_text(f"{dataset.name} ({type(dataset).__name__}): {dataset.root}"))
     for table in tables(dataset, report):
         print_rich(rich_table(table))
-    lines = [f"note: {each}" for each in report.notes]
-    lines += [f"problem: {each}" for each in report.problems]
+    lines = [f"note: {note}" for note in report.notes]
+    lines += [f"problem: {problem}" for problem in report.problems]
     lines += [f"{len(report.problems)} problem(s), {len(report.notes)} note(s)."]
     print_rich(plain_text("\n".join(lines)))
     return 1 if report.problems else 0
 
 
 def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, TextTable]:
-    """Numbers of names and sizes by split; percent of pixels and number of images by class."""
+    """Return a table of names and sizes by split, and one of pixels and images by class."""
     rows = [
         (
             split,
@@ -122,7 +122,7 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
 
 
 def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
-    """Sizes with their number of images; of many, the smallest and the largest."""
+    """Write sizes with their number of images; of many, the smallest and the largest."""
     texts = [f"{height}x{width} ({number})" for (height, width), number in sorted(sizes.items())]
     if len(texts) > 3:
         return f"{texts[0]} to {texts[-1]}, {len(texts)} sizes"
@@ -148,9 +148,9 @@ def check_dataset(
             problems.append((name, found))
         else:
             contents[name] = found
-    problems += [(name, text) for name, each in contents.items() for text in each.problems]
+    problems += [(name, text) for name, found in contents.items() for text in found.problems]
     problems += _mixed(contents)
-    notes += [(name, text) for name, each in contents.items() for text in each.notes]
+    notes += [(name, text) for name, found in contents.items() for text in found.notes]
     splits = {split: _report(dataset, names, contents) for split, names in lists.items()}
     problems += _list_problems(dataset, lists)
     unused = sorted(dataset.unused(lists))
@@ -161,11 +161,11 @@ def check_dataset(
         of_file = OF_FILE.search(text)
         name = of_file[1] or of_file[2] if of_file else ""
         problems.append((name.removeprefix(f"{dataset.root}/"), text))
-    sizes = sorted(set().union(*(each.sizes for each in splits.values())))
+    sizes = sorted({size for report in splits.values() for size in report.sizes})
     if len(sizes) > 1:
         ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
         notes.append(("", f"images differ in size ({ends}); evaluate with data.eval_batch_size=1."))
-    pixels = sum((each.pixels for each in splits.values()), np.zeros(1, np.int64))
+    pixels = sum((report.pixels for report in splits.values()), np.zeros(1, np.int64))
     shown = dict(zip(dataset.classes, pixels, strict=False))
     absent = [f"'{n}'" for n in shown if not shown[n] and n not in dataset.unscored]
     if alone := of_one_class(pixels, dataset.classes, dataset.codes):
@@ -179,7 +179,7 @@ def check_dataset(
 def _read(
     dataset: FileDataset, names: Sequence[str], num_threads: int, is_shown: bool
 ) -> Iterator[Content | str]:
-    """The content of every sample, or why it cannot be read, in order."""
+    """Return the content of every sample, or why it cannot be read, in order."""
 
     def read(name: str) -> Content | str:
         try:
@@ -194,12 +194,15 @@ def _read(
 
 
 def _mixed(contents: Mapping[str, Content]) -> Sentences:
-    """The images whose thermal values are stored with another type than those of most."""
-    kinds = [kind for kind, _ in Counter(each.thermal for each in contents.values()).most_common()]
+    """Find images whose thermal values are stored with another type than those of most."""
+    counts = Counter(content.thermal for content in contents.values())
+    if not counts:
+        return []
+    usual = counts.most_common(1)[0][0]
     return [
-        (name, f"thermal is {each.thermal}, of most images {kinds[0]}; store values of one type.")
-        for name, each in contents.items()
-        if each.thermal != kinds[0]
+        (name, f"thermal is {content.thermal}, of most images {usual}; store values of one type.")
+        for name, content in contents.items()
+        if content.thermal != usual
     ]
 
 
@@ -222,7 +225,7 @@ def _content_of(dataset: FileDataset, name: str) -> Content:
 
 
 def lonely_values(values: NDArray[Any]) -> list[float]:
-    """The lowest and the highest value, if farther from all others than these from each other."""
+    """Return the lowest and the highest value, if farther from the others than these differ."""
     found, rest = [], values.astype(np.float64)
     for sign in (1, -1, 1, -1):  # a second time without what was found
         end = (sign * rest).min()
@@ -237,7 +240,7 @@ def _report(
     dataset: FileDataset, names: Sequence[str], contents: Mapping[str, Content]
 ) -> SplitReport:
     own = [contents[name] for name in dict.fromkeys(names) if name in contents]
-    labelled = [each.pixels for each in own if each.pixels is not None]
+    labelled = [content.pixels for content in own if content.pixels is not None]
     counts = np.array(labelled, np.int64).reshape(-1, dataset.num_classes + 1)
     kinds = Counter(_kind_of(dataset, name) for name in names)
     return SplitReport(
@@ -247,21 +250,21 @@ def _report(
         day=kinds["day"],
         night=kinds["night"],
         mirrored=kinds["mirrored"],
-        sizes=dict(Counter(each.hw for each in own)),
+        sizes=dict(Counter(content.hw for content in own)),
         pixels=counts.sum(0),
         images=(counts > 0).sum(0),
     )
 
 
 def grouped(found: Sentences) -> tuple[str, ...]:
-    """One sentence a kind: the first, after the number of images and the names of three.
+    """Return a sentence a kind: the first, after the number of images and the names of three.
 
     Sentences of a kind differ in the name, in paths, and in numbers that are no values of images.
     """
     kinds: dict[str, Sentences] = defaultdict(list)
     for name, text in found:
         plain = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "", text) if name else text
-        kinds[VARYING.sub(lambda each: each[1] or "", plain)].append((name, text))
+        kinds[VARYING.sub(lambda match: match[1] or "", plain)].append((name, text))
     lines = []
     for (name, text), *others in kinds.values():
         names = ", ".join((name, *(other for other, _ in others[:2])))
@@ -274,18 +277,20 @@ def grouped(found: Sentences) -> tuple[str, ...]:
 
 
 def _kind_of(dataset: FileDataset, name: str) -> str:
-    """Either "mirrored", "day", "night", or "" if that is unknown."""
+    """Return "mirrored", "day", "night", or "" if that is unknown."""
     if dataset.mirrored is not None and name.endswith(dataset.mirrored):
         return "mirrored"
     try:
         nights = dataset.nights((name,))
     except InputError:  # reading it reports the problem
         nights = None
-    return "" if nights is None else "night" if nights[0] else "day"
+    if nights is None:
+        return ""
+    return "night" if nights[0] else "day"
 
 
 def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
-    """What a split lacks that another split has: images by day or at night, or a class."""
+    """Say what a split lacks that another split has: images by day or at night, or a class."""
     whole = {split: r for split, r in splits.items() if not split.endswith(("_day", "_night"))}
     notes = []
     for split, r in whole.items():
@@ -310,7 +315,7 @@ def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
 
 
 def _list_problems(dataset: FileDataset, lists: SplitNames) -> Sentences:
-    """Names listed twice, of another time of day, mirrored for testing, or in two splits.
+    """Find names listed twice, of another time of day, mirrored for testing, or in two splits.
 
     Two splits may share names if one is a part of the other by name, as "test_day" is of "test",
     or if both are made of one source; of such splits the last is checked.

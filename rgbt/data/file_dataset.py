@@ -16,7 +16,7 @@ from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.files import read_names, stored_hw, within
 from rgbt.data.images import PairReader, Range, check_size
 from rgbt.data.labels import LabelCodes
-from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.patterns import FrameFiles, Patterns
 from rgbt.requirements import DatasetRecord
 from rgbt.types import Sample
 
@@ -30,7 +30,7 @@ Whole = tuple[NDArray[np.uint8], NDArray[Any], NDArray[np.uint8] | None]
 
 
 class FileDataset:
-    """A reader of files that never resizes, augments or remaps and refuses inexact content.
+    """Reads files, never resizes, augments or remaps them, and refuses inexact content.
 
     A subclass defines `frame` and `nights`, and sets the attributes below. Its arguments are the
     keys of its file in conf/dataset, which describes each; InputError: no such root, another
@@ -82,7 +82,7 @@ class FileDataset:
 
     @property
     def record(self) -> DatasetRecord:
-        """The number of its classes, and what the first one is."""
+        """State the number of its classes, and what the first one is."""
         first = self.classes[0] in self.background
         return DatasetRecord(
             num_classes=self.num_classes, first_class="background" if first else "object"
@@ -111,26 +111,28 @@ class FileDataset:
         )
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Names of a known split, in order; () if there are none, InputError if unreadable."""
+        """Return the names of a known split; () if there are none, InputError if unreadable."""
         return self.lines(split)
 
     def use_lists(self, lists: Lists) -> None:
         """Read the names of every split from its list or lists."""
-        several = {split: each for split, each in lists.items() if not isinstance(each, str)}
-        self.splits = {
-            split: each if isinstance(each, str) else "+".join(each)
-            for split, each in lists.items()
-        }
-        self.files_of = several
+        self.splits, files_of = {}, {}
+        for split, files in lists.items():
+            if isinstance(files, str):
+                self.splits[split] = files
+            else:
+                self.splits[split] = "+".join(files)
+                files_of[split] = files
+        self.files_of = files_of
 
     def lines(self, split: str) -> tuple[str, ...]:
-        """Lines of the lists of a split, files below the root or anywhere; () without a file.
+        """Return lines of the lists of a split, files below the root or anywhere; () without one.
 
         InputError: of several lists one is missing, or two have a line in common.
         """
         key = f"{self.splits_key}.{split}"
         files = self.files_of.get(split, (self.splits[split],))
-        paths = [self.root / Path(each).expanduser() for each in files]
+        paths = [self.root / Path(file).expanduser() for file in files]
         if len(paths) == 1 and not os.path.lexists(paths[0]):
             return ()
         found = [name for path in paths for name in read_names(path, key)]
@@ -147,14 +149,14 @@ class FileDataset:
             )
 
     def has(self, split: str) -> bool:
-        """Whether any sample of `split` exists; InputError if the split is unknown."""
+        """Say whether any sample of `split` exists; InputError if the split is unknown."""
         self.check_split(split)
         if split not in self._names:
             self._names[split] = self.listed(split)
         return bool(self._names[split])
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order; InputError if it is unknown, missing or empty."""
+        """Return the names of a split, in order; InputError if it is unknown, missing or empty."""
         if not self.has(split):
             raise InputError(
                 f"split '{split}' of {self.name} is empty: expected "
@@ -162,20 +164,20 @@ class FileDataset:
             )
         return self._names[split]
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError if there can be no such frame."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`; InputError if there can be no such frame."""
         raise NotImplementedError
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night; None if the data set does not state it."""
+        """Say which images were taken at night; None if the data set does not state it."""
         raise NotImplementedError
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens: RGB, thermal (if it has its own) and label (if any)."""
+        """Return every file that `read` opens: RGB, thermal (if it has its own), label (if any)."""
         return tuple(dict.fromkeys(path for path in self.frame(name)[2:] if path is not None))
 
     def read(self, name: str) -> Sample:
-        """The sample called `name`: rgb (H, W, 3), thermal (H, W), label (H, W) or None, all uint8.
+        """Read sample `name`: rgb (H, W, 3), thermal (H, W), label (H, W) or None, all uint8.
 
         Raises:
             InputError: no such name, a file is missing, leads out of the root, cannot be decoded,
@@ -185,7 +187,7 @@ class FileDataset:
         return self.made(name, self.whole(name))
 
     def whole(self, name: str) -> Whole:
-        """RGB (H, W, 3), thermal values and label (H, W) of the files; InputError as of `read`."""
+        """Read RGB (H, W, 3), thermal values and label (H, W); InputError as of `read`."""
         frame = self.frame(name)
         rgb, thermal = (within(path, self.root) for path in frame[2:4])
         label = self.codes.read(within(frame.label, self.root)) if frame.label else None
@@ -195,7 +197,7 @@ class FileDataset:
         return pixels, values, label
 
     def made(self, name: str, whole: Whole) -> Sample:
-        """The sample of what `whole` returns; InputError as of `read`."""
+        """Make the sample of what `whole` returns; InputError as of `read`."""
         pixels, values, label = whole
         if label is not None:
             label = np.ascontiguousarray(self.images.cut(label, name))
@@ -203,61 +205,67 @@ class FileDataset:
         return replace(sample, label=label)
 
     def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
+        """Read the images of `read` alone, without the label; InputError as there."""
         return self.images.read(name, *(within(path, self.root) for path in self.frame(name)[2:4]))
 
     def stored_hw(self, name: str) -> tuple[int, int]:
-        """(height, width) of `read`, by the header of the RGB image; InputError if it has none."""
+        """Return (height, width) of `read`, by the header of the RGB image; InputError without."""
         if self.images.crop is None:
             return stored_hw(within(self.frame(name).rgb, self.root))
         top, bottom, left, right = self.images.crop
         return bottom - top, right - left
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone, (H, W) uint8, or None; InputError as there."""
+        """Read the label of `read` alone, (H, W) uint8, or None; InputError as there."""
         path = self.frame(name).label
         return None if path is None else self.codes.read(within(path, self.root))
 
     def fitted(
-        self, label: NDArray[np.uint8], frame: Frame, hw: tuple[int, ...]
+        self, label: NDArray[np.uint8], frame: FrameFiles, hw: tuple[int, ...]
     ) -> NDArray[np.uint8]:
-        """The label of a whole frame of this size, not cut; InputError if it does not fit."""
+        """Return the label of a whole frame of this size, not cut; InputError if it cannot fit."""
         check_size(hw, "its label", label, frame.name, frame.label)
         return label
 
     def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
-        settings = {
-            key: getattr(self.images, key) for key in ("thermal_range", "most_tint", "crop")
+        """Return the settings that change what `read` makes of the files."""
+        return {
+            "codes": sorted(self.codes.codes.items()),
+            "layouts": [str(layout) for layout in self.images.layouts],
+            "thermal_range": self.images.thermal_range,
+            "most_tint": self.images.most_tint,
+            "crop": self.images.crop,
         }
-        layouts = [str(each) for each in self.images.layouts]
-        return {"codes": sorted(self.codes.codes.items()), "layouts": layouts, **settings}
 
     def fingerprint(self) -> str:
-        """See `hash_of_files`; splits that are not there are empty."""
+        """Return `hash_of_files` of all splits; those that are not there are empty."""
         return hash_of_files({split: self.listed(split) for split in self.splits}, self.files)
 
     def repeats(self, split: str) -> bool:
-        """Whether a split only repeats images of other splits, and need not exist."""
+        """Say whether a split only repeats images of other splits, and need not exist."""
         return split.endswith(("_day", "_night"))
 
     def unused(self, lists: SplitNames) -> Collection[Path]:
-        """Files of the layout that belong to no image of a split."""
-        used = {path for names in lists.values() for name in names for path in self.files(name)}
-        patterns = (pattern for pattern in self.patterns if pattern is not None)
-        return {path for each in patterns for path in each.files(self.root)} - used
+        """Return files of the layout that belong to no image of a split."""
+        found: set[Path] = set()
+        for pattern in self.patterns:
+            if pattern is not None:
+                found.update(pattern.files(self.root))
+        for name in {name for names in lists.values() for name in names}:
+            found.difference_update(self.files(name))
+        return found
 
     def own_problems(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
-        """Further problems of names and files; no image is opened."""
+        """Return further problems of names and files; no image is opened."""
         return []
 
     def own_notes(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
-        """Further remarks."""
+        """Return further remarks."""
         return []
 
 
 def hash_of_files(splits: SplitNames, files: Callable[[str], Iterable[Path]]) -> str:
-    """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+    """Return SHA-256 in hexadecimal over names of every split and sizes of their files.
 
     Nothing is decoded and folders are left out, so that equal copies have equal fingerprints.
 
@@ -277,7 +285,7 @@ def hash_of_files(splits: SplitNames, files: Callable[[str], Iterable[Path]]) ->
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file, -1 if it is missing."""
+    """Return the bytes of a file, -1 if it is missing."""
     # A path through a file instead of a folder is missing as well.
     try:
         return path.stat().st_size

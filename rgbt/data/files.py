@@ -66,7 +66,7 @@ UNREADABLE = (
 
 
 def read_bytes(path: Path) -> bytes:
-    """Every byte; InputError for a missing or irregular file, or an error of the system."""
+    """Read every byte; InputError for a missing or irregular file, or an error of the system."""
     try:
         if path.exists() and not path.is_file():  # a pipe would be waited for
             raise InputError(f"{path} is not a regular file; {LEFT_OUT}.")
@@ -79,7 +79,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_names(path: Path, key: str) -> tuple[str, ...]:
-    """Stripped lines of a list file in order, without empty ones.
+    """Read the stripped lines of a list file in order, without empty ones.
 
     Raises:
         InputError: as `read_bytes`, not a text in UTF-8, or no line; `key` begins the message.
@@ -97,7 +97,7 @@ def read_names(path: Path, key: str) -> tuple[str, ...]:
 
 
 def within(path: Path, root: Path) -> Path:
-    """`path`, if it is below `root` after resolving all links; InputError if it is outside.
+    """Return `path` if it is below `root` after resolving all links; InputError if outside.
 
     A reader checks every file that it opens: a line of a list may contain "../..", and a link in a
     downloaded folder may lead anywhere. A missing file passes; `read_bytes` reports it.
@@ -122,7 +122,7 @@ def _resolved(folder: str) -> str:
 
 
 def opened(path: Path) -> tuple[Image.Image, int]:
-    """A decoded image, upright by its EXIF orientation, and the bits per channel of its file.
+    """Decode an image, upright by its EXIF orientation; also returns bits per channel.
 
     The checksums of a PNG are compared. JPEG, TIFF and BMP have none: damage inside them is
     refused if the decoder fails, and otherwise changes pixels.
@@ -136,9 +136,8 @@ def opened(path: Path) -> tuple[Image.Image, int]:
             image.verify()
         image = Image.open(io.BytesIO(data), formats=FORMATS)
         image.load()
-        tags = getattr(
-            image, "tag_v2", {}
-        )  # tags of a TIFF; the header of a PNG is its first chunk
+        tags = getattr(image, "tag_v2", {})  # of a TIFF
+        # The header of a PNG is its first chunk.
         bits = data[24] if image.format == "PNG" else max(np.ravel(tags.get(258, 8)).tolist())
         is_turned = image.format == "TIFF"  # by `load`
         turn = None if is_turned else TURNS.get(image.getexif().get(Base.Orientation, 1))
@@ -161,7 +160,7 @@ def opened(path: Path) -> tuple[Image.Image, int]:
 
 
 def stored_hw(path: Path) -> tuple[int, int]:
-    """(height, width) of `opened`, which reads little of the file; InputError as there."""
+    """Return (height, width) of `opened`, but read little of the file; InputError as there."""
     if not path.is_file():
         raise InputError(f"{path} is missing, or no regular file; {LEFT_OUT}.")
     try:
@@ -181,13 +180,13 @@ def stored_hw(path: Path) -> tuple[int, int]:
 
 
 def values_of(image: Image.Image) -> NDArray[Any]:
-    """(H, W) or (H, W, C) as decoded; sixteen bits in the order of this machine."""
+    """Return (H, W) or (H, W, C) as decoded; sixteen bits in the order of this machine."""
     array = np.asarray(image)
     return array.astype(np.uint16) if image.mode.startswith("I;16") else array
 
 
 def decode(path: Path) -> NDArray[Any]:
-    """An image as written, (H, W) or (H, W, C) in the order R, G, B, A; InputError as `opened`.
+    """Decode an image as written, (H, W) or (H, W, C) as R, G, B, A; InputError as `opened`.
 
     Palettes become the colours that are shown.
     """
@@ -198,7 +197,7 @@ def decode(path: Path) -> NDArray[Any]:
 
 
 def decode_bytes(path: Path, number: int, advice: str) -> Array:
-    """An image of so many channels of 8 bits; InputError for another, which ends in `advice`."""
+    """Decode `number` channels of 8 bits; InputError, which ends in `advice`, for others."""
     image = decode(path)
     if image.dtype != np.uint8:
         raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
@@ -212,18 +211,18 @@ def decode_bytes(path: Path, number: int, advice: str) -> Array:
 
 
 def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
-    """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal."""
+    """Read RGB (H, W, 3) and thermal (H, W), both uint8, of a file of R, G, B, thermal."""
     image = decode_bytes(path, 4, f"use the original file, or {advice}")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), np.uint8), image[..., 3].copy()
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:
-    """RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message about others."""
+    """Read RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message else."""
     return decode_bytes(path, 3, advice)
 
 
 def open_indices(path: Path) -> Image.Image:
-    """A decoded image of one channel that holds whole numbers, perhaps with a palette.
+    """Decode an image of one channel that holds whole numbers, perhaps with a palette.
 
     Raises:
         InputError: as `opened`, several channels, or a format that changes values: JPEG, and grey
@@ -240,7 +239,7 @@ def open_indices(path: Path) -> Image.Image:
 
 
 def read_colours(path: Path) -> Array:
-    """Colours of a label (H, W, 3) uint8, in the order R, G, B, unchanged.
+    """Read colours of a label (H, W, 3) uint8, in the order R, G, B, unchanged.
 
     Of a PNG with a palette the colours are returned; an opaque fourth channel is dropped.
 
@@ -260,7 +259,7 @@ def read_colours(path: Path) -> Array:
 
 
 def read_array(path: Path, what: str) -> NDArray[Any]:
-    """The array of a `.npy` file; InputError if it is missing, damaged, or not `what`."""
+    """Read the array of a `.npy` file; InputError if it is missing, damaged, or not `what`."""
     try:
         file = io.BytesIO(read_bytes(path))
         array = np.load(file, allow_pickle=False)

@@ -21,13 +21,13 @@ from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, Lists, SplitNames, hash_of_files
 from rgbt.data.images import Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
-from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, Frame, find_frames, in_order, without_rgb
+from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, FrameFiles, find_frames, in_order, without_rgb
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 
 
 class Folder(FileDataset):
-    """RGB-thermal pairs in any folder whose paths follow patterns.
+    """Reads RGB-thermal pairs in any folder whose paths follow patterns.
 
     A pattern is a path below the root with words in braces (`rgbt.data.patterns`): {name} is the
     frame, {split} its split, {sequence} a group of consecutive frames, and any other word matches
@@ -80,7 +80,7 @@ class Folder(FileDataset):
             raise InputError(f"dataset.night: '{night}' matches no name of {len(self.frames)}.")
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Names of a known split: drawn, in a folder, or the frames that a list names."""
+        """Return the names of a known split: drawn, in a folder, or named by a list."""
         if split in self._divided:
             return self._divided[split]
         lines = self.lines(split)
@@ -94,7 +94,7 @@ class Folder(FileDataset):
         return names
 
     def _named(self, line: str) -> str:
-        """The frame of a line; of "image,label", as in CART's lists, the label must be its own."""
+        """Return the frame of a line; of "image,label", as in CART's, the label must be its own."""
         image, comma, label = line.partition(",")
         if not comma or line in self._forms:
             return self._forms.get(line) or self._forms.get(_stem(line), line)
@@ -118,10 +118,11 @@ class Folder(FileDataset):
             "dataset.lists": lists is not None,
             "dataset.shares": shares is not None,
         }
-        if sum(given.values()) != 1 or (folders is not None and SPLIT not in pattern.words):
+        found_keys = [key for key, is_given in given.items() if is_given]
+        if len(found_keys) != 1 or (folders is not None and SPLIT not in pattern.words):
             raise InputError(
                 f"dataset: exactly one of {', '.join(given)} must define the splits, got "
-                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
+                f"{' and '.join(found_keys) or 'none'}."
             )
         if lists is not None:
             self.splits_key = "dataset.lists"
@@ -136,8 +137,8 @@ class Folder(FileDataset):
         found = [(name, frame.values[SPLIT]) for name, frame in self.frames.items()]
         return {s: tuple(name for name, f in found if f == word) for s, word in words.items()}
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`, without a label in splits that have none."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`, without a label in splits that have none."""
         if name not in self.frames:
             raise InputError(
                 f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
@@ -147,13 +148,13 @@ class Folder(FileDataset):
         return frame._replace(label=None) if name in self._without_labels else frame
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each name matches `night`; None if it is not given."""
+        """Say which names match `night`; None if it is not given."""
         if self.night is None:
             return None
         return tuple(fnmatchcase(name, self.night) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over `hash_of_files` and the map of label values."""
+        """Return SHA-256 in hexadecimal over `hash_of_files` and the map of label values."""
         listed = {
             split: tuple(name for name in self.listed(split) if name in self.frames)
             for split in self.splits
@@ -163,14 +164,16 @@ class Folder(FileDataset):
         return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
 
     def unused(self, lists: SplitNames) -> Collection[Path]:  # noqa: ARG002 - as every data set
-        """Thermal images and labels without an RGB image."""
+        """Return thermal images and labels without an RGB image."""
         return without_rgb(self.root, self.patterns[1:], self.frames.values())
 
     def own_notes(self, lists: SplitNames) -> list[str]:
-        """Frames of no split."""
-        listed = set().union(*lists.values())
+        """Name the frames of no split."""
+        listed = {name for names in lists.values() for name in names}
         others = [name for name in self.frames if name not in listed]
-        return [f"{len(others)} frames are in no split; the first is '{n}'." for n in others[:1]]
+        if not others:
+            return []
+        return [f"{len(others)} frames are in no split; the first is '{others[0]}'."]
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
@@ -178,7 +181,7 @@ class Folder(FileDataset):
 
     @cached_property
     def _forms(self) -> dict[str, str]:
-        """Everything that a line of a list may be -> the name of the frame; names come first.
+        """Return the name of the frame for everything that a line may be; names come first.
 
         The name; the values of the words of the RGB pattern, joined by "/"; the path of the RGB or
         thermal image below the root, with or without suffix; or the value of {name}, if unique.
@@ -186,7 +189,8 @@ class Folder(FileDataset):
         shared = Counter(frame.values[NAME] for frame in self.frames.values())
         forms = {name: name for name in self.frames}
         for name, frame in self.frames.items():
-            paths = [each.relative_to(self.root).as_posix() for each in (frame.rgb, frame.thermal)]
+            files = (frame.rgb, frame.thermal)
+            paths = [path.relative_to(self.root).as_posix() for path in files]
             for form in ("/".join(frame.values.values()), *paths, *map(_stem, paths)):
                 forms.setdefault(form, name)
             if shared[frame.values[NAME]] == 1:
@@ -195,7 +199,7 @@ class Folder(FileDataset):
 
 
 def draw_shares(
-    frames: Mapping[str, Frame], shares: Mapping[str, float], seed: int, block: int | None
+    frames: Mapping[str, FrameFiles], shares: Mapping[str, float], seed: int, block: int | None
 ) -> dict[str, tuple[str, ...]]:
     """Divide frames at random into splits: split -> its names, in the order of all frames.
 
@@ -210,7 +214,7 @@ def draw_shares(
             "dataset.shares: expected shares above 0 that add up to 1, such as {train: 0.8, "
             f"val: 0.1, test: 0.1}}, got {dict(shares)}."
         )
-    sequences: dict[str, list[Frame]] = defaultdict(list)
+    sequences: dict[str, list[FrameFiles]] = defaultdict(list)
     for frame in frames.values():
         sequences[frame.values.get(SEQUENCE, "")].append(frame)
     units: list[list[str]] = []
@@ -225,7 +229,7 @@ def draw_shares(
     lacking = {split: share * len(frames) for split, share in shares.items()}
     split_of: dict[str, str] = {}
     for index in numpy_generator(seed, "shares").permutation(len(units)):
-        split = max(lacking, key=lambda each: lacking[each])
+        split = max(lacking, key=lambda name: lacking[name])
         split_of |= dict.fromkeys(units[index], split)
         lacking[split] -= len(units[index])
     drawn = {split: tuple(n for n in frames if split_of[n] == split) for split in shares}
@@ -241,5 +245,5 @@ def draw_shares(
 
 
 def _stem(line: str) -> str:
-    """`line` without what follows the last dot of its last piece."""
+    """Return `line` without what follows the last dot of its last piece."""
     return str(PurePath(line).with_suffix("")) if PurePath(line).name else line

@@ -15,42 +15,28 @@ from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, SplitNames, size_of
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
-from rgbt.data.patterns import Frame, Patterns, WordValues
+from rgbt.data.patterns import FrameFiles, Patterns, WordValues
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
 
-CLASSES = (
-    "road",
-    "sidewalk",
-    "building",
-    "curb",
-    "fence",
-    "pole",
-    "vegetation",
-    "terrain",
-    "sky",
-    "person",
-    "car",
-    "bicycle",
-    "background",
-    "ignore",
-)
-PALETTE = (
-    (128, 64, 128),
-    (244, 35, 232),
-    (70, 70, 70),
-    (196, 196, 196),
-    (190, 153, 153),
-    (153, 153, 153),
-    (107, 142, 35),
-    (152, 251, 152),
-    (70, 130, 180),
-    (220, 20, 60),
-    (0, 0, 142),
-    (119, 11, 32),
-    (138, 43, 226),
-    (0, 0, 0),
-)
+# Class -> its colour, in the order of the indices.
+COLOURS = {
+    "road": (128, 64, 128),
+    "sidewalk": (244, 35, 232),
+    "building": (70, 70, 70),
+    "curb": (196, 196, 196),
+    "fence": (190, 153, 153),
+    "pole": (153, 153, 153),
+    "vegetation": (107, 142, 35),
+    "terrain": (152, 251, 152),
+    "sky": (70, 130, 180),
+    "person": (220, 20, 60),
+    "car": (0, 0, 142),
+    "bicycle": (119, 11, 32),
+    "background": (138, 43, 226),
+    "ignore": (0, 0, 0),
+}
+CLASSES, PALETTE = tuple(COLOURS), tuple(COLOURS.values())
 TRAIN = tuple(
     f"train/{{sequence}}/{{piece}}/{kind}/{kind}_{{stamp}}.png"
     for kind in ("fl_rgb", "fl_ir_aligned", "fl_rgb_labels")
@@ -89,7 +75,7 @@ Array = NDArray[np.uint8]
 
 
 class Freiburg(FileDataset):
-    """RGB-thermal street scenes of Freiburg, in the layout of their archives.
+    """Reads RGB-thermal street scenes of Freiburg, in the layout of their archives.
 
     Layout (XX and YY are digits; sec and nsec are seconds and nanoseconds):
         train/seq_XX_{day|night}/YY/fl_rgb/fl_rgb_<sec>_<nsec>.png               8 bit, RGB
@@ -147,12 +133,12 @@ class Freiburg(FileDataset):
             advice="use the original file, which holds the counts of dataset.thermal_range",
         )
         self.splits = SPLITS
-        self._frames: dict[str, Frame] = {}
+        self._frames: dict[str, FrameFiles] = {}
         self._partners: list[Path] = []
         self._list()
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Names of a split, sorted, day before night; InputError if `val_sequences` names none."""
+        """Return a split's names, sorted, day first; InputError if `val_sequences` names none."""
         days = [f for f in self._frames.values() if f.values["part"] in ("train_day", "val_day")]
         known = sorted({word for frame in days for word in _sequences(frame.values)})
         for word in self.val_sequences if known and split in ("train", "train_day", "val") else ():
@@ -160,11 +146,11 @@ class Freiburg(FileDataset):
         return self._of(split)
 
     def label(self, name: str) -> Array | None:
-        """The label of `read` alone; the frame is read as well, for its size."""
+        """Return the label of `read` alone; the frame is read as well, for its size."""
         return self.read(name).label
 
-    def fitted(self, label: Array, frame: Frame, hw: tuple[int, ...]) -> Array:
-        """The label, resized to the frame with the nearest pixel; in tests, with ignored classes.
+    def fitted(self, label: Array, frame: FrameFiles, hw: tuple[int, ...]) -> Array:
+        """Resize the label to the frame, nearest; in tests, some classes become ignored.
 
         InputError for another aspect ratio.
         """
@@ -183,16 +169,16 @@ class Freiburg(FileDataset):
         return label
 
     def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
+        """Return the settings that change what `read` makes of the files."""
         own = {"ignored_test": self.ignored_test, "val_sequences": self.val_sequences}
         return {**super().decoding(), **own, "classes": self.classes}
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
-        """Whether each frame is in a night folder; InputError if there is no such frame."""
+        """Say which frames are in a night folder; InputError if there is no such frame."""
         return tuple(self.frame(name).values["part"].endswith("night") for name in names)
 
     def fingerprint(self) -> str:
-        """Digest of `hash_of_files` and the settings of labels (crop, `ignored_test`)."""
+        """Return a digest of names, sizes of files and settings (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.images.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(SPLITS):
             names = self._of(split)
@@ -202,18 +188,18 @@ class Freiburg(FileDataset):
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError if there is no such frame."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`; InputError if there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self._frames[name]
 
     def repeats(self, split: str) -> bool:
-        """The split "train" is "train_day", "test" the day followed by the night; "val" may be."""
+        """Say whether a split repeats others: "train", "test", and "val" without sequences."""
         return split in ("train", "test") or (split == "val" and not self.val_sequences)
 
     def unused(self, lists: SplitNames) -> list[Path]:  # noqa: ARG002 - as every data set
-        """Thermal images and labels without an RGB image."""
+        """Return thermal images and labels without an RGB image."""
         used = {path for frame in self._frames.values() for path in frame[2:]}
         return [path for path in self._partners if path not in used]
 
@@ -228,11 +214,14 @@ class Freiburg(FileDataset):
         tests = ({"part": "test", "time": time} for time in ("day", "night"))
         for texts, known in ((TRAIN, {}), *((TEST, values) for values in tests)):
             patterns = Patterns.of(*texts)
-            rgb, *others = (
-                each.files(self.root, known, any_case=True) for each in patterns if each is not None
-            )
-            self._partners += [path for files in others for path in files]
-            thermals, labels = ({tuple(v.values()): p for p, v in each.items()} for each in others)
+            rgb, *others = [
+                pattern.files(self.root, known, any_case=True) for pattern in patterns if pattern
+            ]
+            for files in others:
+                self._partners += files
+            thermals, labels = [
+                {tuple(values.values()): path for path, values in files.items()} for files in others
+            ]
             for path, values in rgb.items():
                 words = tuple(values.values())
                 sequence = values.get("sequence", values.get("time", ""))
@@ -247,7 +236,7 @@ class Freiburg(FileDataset):
                 is_test = part.startswith("test")
                 without = (*words[:-1], words[-1].removesuffix("0")) if is_test else words
                 expected = patterns.frame(self.root, "", values)
-                frame = Frame(
+                frame = FrameFiles(
                     name="_".join(words),
                     values={**values, "part": part},
                     rgb=path,
@@ -269,5 +258,5 @@ class Freiburg(FileDataset):
 
 
 def _sequences(values: WordValues) -> tuple[str, str]:
-    """The training sequence of a frame, and the piece of it: "seq_00_day", "seq_00_day/00"."""
+    """Return a frame's training sequence and the piece of it: "seq_00_day", "seq_00_day/00"."""
     return values["sequence"], f"{values['sequence']}/{values['piece']}"

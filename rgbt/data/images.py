@@ -28,17 +28,17 @@ Range = tuple[Level, Level]
 
 @runtime_checkable
 class ReadsPairs(Protocol):
-    """A data set that also reads images without a label; `images`: those of any folder."""
+    """Is a data set that also reads images without a label; `images`: those of any folder."""
 
     images: PairReader
 
     def pair(self, name: str) -> Sample:
-        """The images of a sample, without its label; InputError as in `PairReader.read`."""
+        """Read the images of a sample, without its label; InputError as in `PairReader.read`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairReader:
-    """RGB of 8 bits, and thermal values that become grey levels.
+    """Reads RGB of 8 bits, and thermal values, which become grey levels.
 
     Attributes:
         layouts: path patterns of the images of the data set, without labels.
@@ -57,7 +57,7 @@ class PairReader:
     advice: str = "use the original file"
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
-        """The pair `name`, read from two files like a training sample, without a label.
+        """Read the pair `name` from two files like a training sample, without a label.
 
         Both are one file where thermal is the fourth channel; of a data set of separate images, it
         holds grey levels as the network sees them.
@@ -74,7 +74,7 @@ class PairReader:
     def whole(
         self, name: str, rgb: Path, thermal: Path, label_hw: tuple[int, ...] | None = None
     ) -> tuple[Array, NDArray[Any]]:
-        """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`.
+        """Read RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`.
 
         Of two sizes, that of the label, `label_hw`, is taken for the right one.
         """
@@ -89,13 +89,13 @@ class PairReader:
         return pixels, values
 
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
-        """The sample of whole images: cut, and thermal as grey levels; errors as of `read`."""
+        """Make the sample of whole images: cut, thermal as grey levels; errors as of `read`."""
         levels = grey(self.cut(values, name), self.thermal_range, path)
         cut = np.ascontiguousarray(self.cut(pixels, name))
         return Sample(rgb=cut, thermal=np.ascontiguousarray(levels), label=None, name=name)
 
     def check_values(self, values: NDArray[Any], path: Path) -> NDArray[Any]:
-        """Thermal values as (H, W), of (H, W) or of (H, W, 3) with channels that are almost equal.
+        """Return thermal values (H, W), of (H, W) or (H, W, 3) with almost equal channels.
 
         InputError, in a message with the name `path`: channels that differ, other bits, or NaN.
         """
@@ -132,7 +132,7 @@ class PairReader:
         return np.asarray((values.sum(axis=-1, dtype=np.uint16) + 1) // 3, np.uint8)
 
     def cut(self, image: NDArray[Any], name: str) -> NDArray[Any]:
-        """The part of a whole image (H, W, ...) that is read; InputError if the crop is larger."""
+        """Cut a whole image (H, W, ...) to the part that is read; InputError if it is smaller."""
         if self.crop is None:
             return image
         top, bottom, left, right = self.crop
@@ -159,7 +159,7 @@ def check_size(
 
 
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
-    """Grey levels of thermal values: round(255 (min(max(v, low), high) - low) / (high - low)).
+    """Convert thermal values v to round(255 (min(max(v, low), high) - low) / (high - low)).
 
     Halves go upwards. Without `limits`, (low, high), the values are grey levels of 8 bits.
     InputError for values of 8 bits with limits that these cannot reach.

@@ -12,51 +12,32 @@ from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
-from rgbt.data.patterns import Frame, Pattern, Patterns
+from rgbt.data.patterns import FrameFiles, Pattern, Patterns
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
-CLASSES = (
-    "road",
-    "sidewalk",
-    "building",
-    "wall",
-    "fence",
-    "pole",
-    "traffic_light",
-    "traffic_sign",
-    "vegetation",
-    "terrain",
-    "sky",
-    "person",
-    "rider",
-    "car",
-    "truck",
-    "bus",
-    "train",
-    "motorcycle",
-    "bicycle",
-)
-PALETTE = (
-    (128, 64, 128),
-    (244, 35, 232),
-    (70, 70, 70),
-    (102, 102, 156),
-    (190, 153, 153),
-    (153, 153, 153),
-    (250, 170, 30),
-    (220, 220, 0),
-    (107, 142, 35),
-    (152, 251, 152),
-    (70, 130, 180),
-    (220, 20, 60),
-    (255, 0, 0),
-    (0, 0, 142),
-    (0, 0, 70),
-    (0, 60, 100),
-    (0, 80, 100),
-    (0, 0, 230),
-    (119, 11, 32),
-)
+# Class -> its colour, in the order of the indices.
+COLOURS = {
+    "road": (128, 64, 128),
+    "sidewalk": (244, 35, 232),
+    "building": (70, 70, 70),
+    "wall": (102, 102, 156),
+    "fence": (190, 153, 153),
+    "pole": (153, 153, 153),
+    "traffic_light": (250, 170, 30),
+    "traffic_sign": (220, 220, 0),
+    "vegetation": (107, 142, 35),
+    "terrain": (152, 251, 152),
+    "sky": (70, 130, 180),
+    "person": (220, 20, 60),
+    "rider": (255, 0, 0),
+    "car": (0, 0, 142),
+    "truck": (0, 0, 70),
+    "bus": (0, 60, 100),
+    "train": (0, 80, 100),
+    "motorcycle": (0, 0, 230),
+    "bicycle": (119, 11, 32),
+}
+CLASSES, PALETTE = tuple(COLOURS), tuple(COLOURS.values())
 PATTERNS = (
     "images/{set}/{video}/visible/{frame}.jpg",
     "images/{set}/{video}/lwir/{frame}.jpg",
@@ -76,7 +57,7 @@ NAME = re.compile(r"(?P<set>set(?:0\d|1[01]))_(?P<video>V\d{3})_(?P<frame>I\d{5}
 
 
 def parts_of(name: str) -> dict[str, str]:
-    """Set, video and frame of `name`, as set00, V000 and I00050; InputError if it is invalid."""
+    """Split `name` into set, video and frame, as set00, V000, I00050; InputError if invalid."""
     match = NAME.fullmatch(name)
     if match is None:
         raise InputError(f"'{name}' is not a name such as set00_V000_I00050, of a set up to 11.")
@@ -84,12 +65,12 @@ def parts_of(name: str) -> dict[str, str]:
 
 
 def set_of(name: str) -> int:
-    """Number of the recording of `name`; InputError if the name is invalid."""
+    """Return the number of the recording of `name`; InputError if the name is invalid."""
     return int(parts_of(name)["set"].removeprefix("set"))
 
 
 class KP(FileDataset):
-    """RGB-thermal street scenes by day and at night with labels, as the CRM release lays them out.
+    """Reads RGB-thermal street scenes by day and night, as the CRM release lays them out.
 
     Layout (XX is the set, 00 to 11; a name of this data set is setXX_VYYY_IZZZZZ):
     images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg and labels/setXX_VYYY_IZZZZZ.png.
@@ -135,29 +116,29 @@ class KP(FileDataset):
         self.splits = by_set if self.by_set else dict(splits)
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in the order of its list, or sorted; InputError for invalid names."""
+        """Return names of a split, in its list's order, or sorted; InputError for invalid ones."""
         if self.by_set:
             return tuple(name for name in self._labels if set_of(name) in SETS_OF[split])
         names = tuple(line.removesuffix(".png") for line in self.lines(split))
         self.nights(names)  # refuses invalid names
         return names
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError if the name is invalid."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`; InputError if the name is invalid."""
         return self.patterns.frame(self.root, name, parts_of(name))
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
-        """Whether each image was taken at night, by set number; InputError for other names."""
+        """Say which images were taken at night, by set number; InputError for other names."""
         return tuple(set_of(name) in NIGHT_SETS for name in names)
 
     def unused(self, lists: SplitNames) -> list[Path]:
-        """Labels of no split; images without a label are many and not meant."""
+        """Return labels of no split; images without a label are many and not meant."""
         listed = set().union(*lists.values())
         return [path for name, path in self._labels.items() if name not in listed]
 
     @cached_property
     def _labels(self) -> dict[str, Path]:
-        """Name -> label file, sorted, of all that are there; listed once."""
+        """Return the label file of each name, sorted, of all that are there; listed once."""
         files = Pattern(PATTERNS[2], "dataset.root").files(self.root)
         return {path.stem: path for path in files if NAME.fullmatch(path.stem)}
 

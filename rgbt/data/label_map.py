@@ -15,7 +15,7 @@ from rgbt.ranges import Byte, Names, NumClasses, Text
 
 @dataclass(frozen=True, kw_only=True)
 class LabelMap:
-    """The class of a data set for each class of a network; `groups`: class -> ids that become it.
+    """Maps classes of a network to classes of a data set; `groups`: class -> ids that become it.
 
     Ids are mapped after the argmax, as in the thesis: probabilities of classes that map to one
     class are not added up. The confidence is that of the most probable class.
@@ -38,7 +38,7 @@ class LabelMap:
             )
 
     def __call__(self, classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Ids of the data set for ids of the network, any shape, below `num_source`."""
+        """Map ids of the network, any shape, below `num_source`, to ids of the data set."""
         table = np.empty(self.num_source, np.uint8)
         for name, group in self.groups.items():
             table[list(group)] = self.targets.index(name)

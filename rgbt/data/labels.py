@@ -30,7 +30,7 @@ Colours = Mapping[str, Colour | tuple[Colour, ...]]
 
 @dataclass(frozen=True)
 class LabelCodes:
-    """Values of label files and the class of each.
+    """Holds values of label files and the class of each.
 
     Attributes:
         codes: whole number -> class index, or 255; a colour is 65536 red + 256 green + blue.
@@ -45,7 +45,7 @@ class LabelCodes:
     assumed: bool = False
 
     def read(self, path: Path) -> Array:
-        """Class indices (H, W) uint8, 255 = ignored, of an image or a `.npy` file.
+        """Read class indices (H, W) uint8, 255 = ignored, of an image or a `.npy` file.
 
         Raises:
             InputError: it cannot be read, or holds a value without a class: which, and how often.
@@ -66,7 +66,7 @@ class LabelCodes:
         return self.classes(raw, path)
 
     def classes(self, raw: NDArray[Any], path: Path) -> Array:
-        """`read` of the values (H, W) of `path`, whole numbers of any type."""
+        """Map the values (H, W) of `path`, whole numbers of any type, as `read` does."""
         if raw.dtype == np.uint8:
             classes = np.asarray(cv2.LUT(raw, self._of_bytes))
         else:
@@ -95,13 +95,13 @@ class LabelCodes:
 
 
 def code_of(colours: NDArray[Any]) -> NDArray[np.int64]:
-    """(..., 3) red, green and blue as one number each: 65536 red + 256 green + blue."""
+    """Join red, green and blue (..., 3) to one number: 65536 red + 256 green + blue."""
     red, green, blue = np.moveaxis(colours.astype(np.int64), -1, 0)
     return np.asarray(65536 * red + 256 * green + blue)
 
 
 def indices(num_classes: int, *ignored: int) -> LabelCodes:
-    """Values that are class indices; 255 and `ignored` do not count."""
+    """Take values for class indices; 255 and `ignored` do not count."""
     codes = {value: value for value in range(num_classes)}
     return LabelCodes({**codes, **dict.fromkeys((*ignored, IGNORE), IGNORE)}, assumed=True)
 
@@ -112,7 +112,7 @@ def label_codes(
     colours: Colours | None,
     ignored: tuple[int | Colour, ...],
 ) -> LabelCodes:
-    """The map of label values of a configuration, see `rgbt.data.folder.Folder`.
+    """Return the map of label values of a configuration, see `rgbt.data.folder.Folder`.
 
     Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
     it a class. InputError: both ids and colours, an unknown class, or a value that occurs twice.
@@ -125,7 +125,9 @@ def label_codes(
         words = dict(enumerate(classes)) if ids is None else ids
         pairs = [(word, value) for value, word in words.items()]
     else:
-        pairs = [(word, one) for word, given in colours.items() for one in each_colour(given)]
+        pairs = []
+        for word, given in colours.items():
+            pairs += [(word, colour) for colour in each_colour(given)]
     for word, _ in pairs:
         check_choice(key, word, classes)
     codes: dict[int, int] = {}
@@ -146,13 +148,13 @@ def label_codes(
 
 
 def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
-    """The colours of a class, which may be one or several."""
-    is_one = all(isinstance(each, int) for each in given)
+    """Return the colours of a class, which may be one or several."""
+    is_one = all(isinstance(level, int) for level in given)
     return (cast(Colour, given),) if is_one else cast(tuple[Colour, ...], given)
 
 
 def painted(num_classes: int) -> tuple[Colour, ...]:
-    """Colours that differ for up to 256 classes, as in the masks of PASCAL VOC.
+    """Return colours that differ for up to 256 classes, as in the masks of PASCAL VOC.
 
     The bits of the index are dealt out to red, green and blue in turn, each from its highest bit
     downwards: 0 black, 1 dark red, 2 dark green, 3 dark yellow.
@@ -165,7 +167,7 @@ def painted(num_classes: int) -> tuple[Colour, ...]:
 
 
 def label_pixels(label: Array, num_classes: int) -> PixelCounts:
-    """(K + 1,) pixels of each class in a label (H, W); the last are ignored."""
+    """Count the pixels of each class in a label (H, W): (K + 1,), the last are ignored."""
     counts = np.bincount(label.ravel(), minlength=IGNORE + 1)
     return np.append(counts[:num_classes], counts[IGNORE])
 
@@ -173,7 +175,7 @@ def label_pixels(label: Array, num_classes: int) -> PixelCounts:
 def pixels_of(
     dataset: LabelledDataset, name: str, on_error: Literal["raise", "skip"]
 ) -> PixelCounts:
-    """`label_pixels` of an image of a data set; 0 without a label.
+    """Count `label_pixels` of an image of a data set; 0 without a label.
 
     A label that cannot be read is an InputError, or counts as none with on_error="skip".
     """
@@ -189,7 +191,7 @@ def pixels_of(
 def classes_in(
     dataset: LabelledDataset, names: Sequence[str], on_error: Literal["raise", "skip"]
 ) -> tuple[PixelCounts, bool]:
-    """`label_pixels` of the labels that were read, and whether these are all.
+    """Count `label_pixels` of the labels that were read, and say whether these are all.
 
     Reading stops when every scored class has a pixel, and after `MOST_LABELS` labels, evenly
     spread, when two classes have. An unlabelled image has no pixel. InputError: an unreadable one.
@@ -207,7 +209,7 @@ def classes_in(
 
 
 def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes | None) -> str:
-    """A sentence where pixels (K + 1,) of labels are of one class of several, or none; else "".
+    """Return a sentence where pixels (K + 1,) are of one class of several, or none; else "".
 
     With `codes`, it asks whether a value 255 that no setting ignores is another class.
     """
@@ -219,7 +221,8 @@ def of_one_class(pixels: PixelCounts, classes: Sequence[str], codes: LabelCodes 
         return f"the labels show {only}; a score over one class is no score"
     index = shown[0] if shown else 0
     other = 1 if index == 0 else 0
-    value = next((value for value, each in codes.codes.items() if each == index), index)
+    values = [value for value, of_class in codes.codes.items() if of_class == index]
+    value = values[0] if values else index
     ids = f"{{{value}: {classes[index]}, {IGNORE}: {classes[other]}}}"
     advice = f"in its YAML write ids: {ids} if it is a class, ignored: [{IGNORE}] if it is none"
     if not codes.key:

@@ -13,34 +13,25 @@ from rgbt.data.file_dataset import FileDataset
 from rgbt.data.files import read_array
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
-from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.patterns import FrameFiles, Patterns
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 Layout = Literal["packed", "folders"]
 
-CLASSES = (
-    "unlabeled",
-    "car",
-    "person",
-    "bike",
-    "curve",
-    "car_stop",
-    "guardrail",
-    "color_cone",
-    "bump",
-)
-PALETTE = (
-    (0, 0, 0),
-    (64, 0, 128),
-    (64, 64, 0),
-    (0, 128, 192),
-    (0, 0, 192),
-    (128, 128, 0),
-    (64, 64, 128),
-    (192, 128, 128),
-    (192, 64, 0),
-)
+# Class -> its colour, in the order of the indices.
+COLOURS = {
+    "unlabeled": (0, 0, 0),
+    "car": (64, 0, 128),
+    "person": (64, 64, 0),
+    "bike": (0, 128, 192),
+    "curve": (0, 0, 192),
+    "car_stop": (128, 128, 0),
+    "guardrail": (64, 64, 128),
+    "color_cone": (192, 128, 128),
+    "bump": (192, 64, 0),
+}
+CLASSES, PALETTE = tuple(COLOURS), tuple(COLOURS.values())
 LAYOUTS: dict[Layout, tuple[str, str, str]] = {
     "packed": ("images/{name}.png", "images/{name}.png", "labels/{name}.png"),
     "folders": ("RGB/{name}.png", "Thermal/{name}.png", "Label/{name}.png"),
@@ -54,7 +45,7 @@ NEXT = "next"
 
 
 class MFNet(FileDataset):
-    """RGB-thermal street scenes with labels, in the layout of the MFNet archive.
+    """Reads RGB-thermal street scenes with labels, in the layout of the MFNet archive.
 
     Layouts (NAME is a line of a split list, five digits and D for day or N for night):
         packed:  images/NAME.png with channels R, G, B, thermal, and labels/NAME.png
@@ -82,23 +73,28 @@ class MFNet(FileDataset):
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
         super().__init__(root, name, num_classes, classes, palette, background=background)
-        wanted = [each for each in LAYOUTS if layout in ("auto", each)]
-        folders = {each: [text.partition("/")[0] for text in LAYOUTS[each]] for each in wanted}
-        found = [each for each in wanted if all((self.root / f).is_dir() for f in folders[each])]
+        found, listed = [], []
+        for kind, texts in LAYOUTS.items():
+            if layout not in ("auto", kind):
+                continue
+            folders = sorted({text.partition("/")[0] for text in texts})
+            listed.append("+".join(folders))
+            if all((self.root / folder).is_dir() for folder in folders):
+                found.append(kind)
         if not found:
-            listed = " or ".join("+".join(sorted(set(folders[each]))) for each in wanted)
-            raise InputError(f"dataset.root: '{root}' does not hold the folders {listed}.")
+            wanted = " or ".join(listed)
+            raise InputError(f"dataset.root: '{root}' does not hold the folders {wanted}.")
         self.layout = found[0]
         self.patterns = Patterns.of(*LAYOUTS[self.layout])
         self.codes = indices(num_classes)
         self.use_lists(splits)
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`."""
         return self.patterns.frame(self.root, name, {"name": name})
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each name ends in N, not D; None if no name does, InputError if only some do."""
+        """Say which names end in N, not D; None if no name does, InputError if only some do."""
         times = [name.removesuffix(MIRRORED)[-1:] for name in names]
         without = [name for name, time in zip(names, times, strict=True) if time not in ("D", "N")]
         if without and len(without) < len(names):
@@ -108,12 +104,12 @@ class MFNet(FileDataset):
         return None if without else tuple(time == "N" for time in times)
 
     def repeats(self, split: str) -> bool:
-        """Lists by time of day only repeat names of others, and need not exist."""
+        """Say that lists by time of day only repeat names of others, and need not exist."""
         return super().repeats(split) and not self.has(split)
 
 
 class NextFrames:
-    """The second frames of a data set, and the positions of their points in the first frames.
+    """Reads the second frames of a data set, and where their points are in the first frames.
 
     The folder `next` beside the images has the same layout and names, one moment later, and
     flow/NAME.npy, (H, W, 2) float32: for every pixel of the second frame, how many (rows, columns)
@@ -148,7 +144,7 @@ class NextFrames:
         )
 
     def flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
-        """Offset (H, W, 2) in rows and columns of each pixel of the second frame to the first.
+        """Read the offset (H, W, 2) in rows and columns of pixels of the second frame to the first.
 
         NaN if the point was not visible there. InputError: no flow, or not of the size `image_hw`.
         """
@@ -162,7 +158,7 @@ class NextFrames:
         return np.asarray(flow, np.float32)
 
     def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
-        """Position of each pixel of the second frame in the first frame.
+        """Return the position of each pixel of the second frame in the first frame.
 
         Returns:
             rows and columns (H, W) int64, nearest pixels; -1 if the point was not visible.

@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbt.checks import InputError, nearest
 from rgbt.data.images import PairReader, ReadsPairs
-from rgbt.data.patterns import Frame, Patterns, what_is_in
+from rgbt.data.patterns import FrameFiles, Patterns, what_is_in
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
 
@@ -27,7 +27,7 @@ PLAIN = (
 
 @dataclass(frozen=True)
 class ToPredict:
-    """Images to predict, in order, by name; names of written files begin with theirs.
+    """Holds images to predict, in order, by name; names of written files begin with theirs.
 
     `read` returns the images of a name, without a label; `folders` hold the files, which must not
     be overwritten; `skipped`: name -> error, to which `samples` adds.
@@ -39,7 +39,7 @@ class ToPredict:
     skipped: dict[str, str] = field(default_factory=dict)
 
     def samples(self, on_error: Literal["raise", "skip"]) -> Iterator[Sample]:
-        """The images in order; InputError for the first unreadable one, or if all are."""
+        """Yield the images in order; InputError for the first unreadable one, or if all are."""
         for name in self.names:
             try:
                 sample = self.read(name)
@@ -60,7 +60,7 @@ class ToPredict:
 
 
 def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
-    """The images of a split; labels are not read if the data set can read pairs alone."""
+    """Return the images of a split; labels are not read if the data set can read pairs alone."""
     names = dataset.names(split)
     reader = reader_of(dataset)
     read = reader.pair if isinstance(reader, ReadsPairs) else reader.read
@@ -69,7 +69,7 @@ def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
 
 
 def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "skip"]) -> ToPredict:
-    """The image of a packed file, or the pairs of a folder.
+    """Return the image of a packed file, or the pairs of a folder.
 
     A folder is read by the patterns of the data set, or by `PLAIN`: the first of them that matches
     a pair. An RGB image without a thermal image is left out if `on_error` is "skip".
@@ -85,7 +85,7 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
             f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name} "
             f"({nearest(text, dataset.splits)})."
         )
-    pairs: dict[str, Frame] = {}
+    pairs: dict[str, FrameFiles] = {}
     for layout in (*images.layouts, *PLAIN):
         pairs = layout.frames(folder)
         if any(frame.thermal.is_file() for frame in pairs.values()):
@@ -102,9 +102,10 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
         for frame in pairs.values()
         if not frame.thermal.exists()
     }
-    for reason in list(alone.values())[: on_error == "raise"]:
+    if alone and on_error == "raise":
+        first = next(iter(alone.values()))
         raise InputError(
-            f"input={text}: {len(alone)} RGB images have no thermal image: {reason} Restore it, or "
+            f"input={text}: {len(alone)} RGB images have no thermal image: {first} Restore it, or "
             "skip such images with data.on_error=skip."
         )
     pairs = {name: frame for name, frame in pairs.items() if str(frame.rgb) not in alone}
@@ -114,7 +115,7 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
 
 
 def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
-    """One pair, named after its RGB file; the same file twice is a packed one."""
+    """Return one pair, named after its RGB file; the same file twice is a packed one."""
     images = images_of(dataset)
     for name, path in {"rgb": rgb, "thermal": thermal}.items():
         if not path.is_file():
@@ -127,7 +128,7 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
 
 
 def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
-    """One pair of arrays, rgb (H, W, 3) uint8 and thermal (H, W), without a label.
+    """Return a pair of arrays, rgb (H, W, 3) uint8 and thermal (H, W), without a label.
 
     Thermal values of 8 bits are grey levels, as in `Sample`. Values of other types are those of the
     camera, and both images are read like files of the data set: cut, and scaled by its
@@ -154,7 +155,7 @@ def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
 
 
 def images_of(dataset: LabelledDataset) -> PairReader:
-    """The reader of new images of a data set; InputError if it has none."""
+    """Return the reader of new images of a data set; InputError if it has none."""
     reader = reader_of(dataset)
     if not isinstance(reader, ReadsPairs):
         raise InputError(

@@ -23,7 +23,7 @@ WordValues = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Pattern:
-    """Paths below a root, in which a word in braces matches any text without a slash.
+    """Matches paths below a root; a word in braces matches any text without a slash.
 
     A word that occurs twice has the same value in both positions. Of two words in one piece of the
     path the first matches as much as possible: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
@@ -51,17 +51,17 @@ class Pattern:
 
     @cached_property
     def words(self) -> tuple[str, ...]:
-        """Words in braces, in order."""
+        """Return the words in braces, in order."""
         return tuple(dict.fromkeys(re.findall(r"\{(\w+)\}", self.text)))
 
     def path(self, root: Path, values: WordValues) -> Path:
-        """The file of `values`, which has every word."""
+        """Return the file of `values`, which has every word."""
         return root / _filled(self.text, values)
 
     def files(
         self, root: Path, values: WordValues = MappingProxyType({}), *, any_case: bool = False
     ) -> dict[Path, WordValues]:
-        """The paths below `root` that match, sorted, and the values of the words in each.
+        """Return the paths below `root` that match, sorted, and the values of the words in each.
 
         Words with a value match this one alone. Names that begin with a dot are left out, as
         operating systems write such files. InputError if a folder may not be listed.
@@ -69,28 +69,36 @@ class Pattern:
         text = _filled(self.text, values)
         wild = re.sub(r"\{\w+\}", "*", glob.escape(text))
         if any_case:
-            wild = re.sub(r"[^\W\d_]", lambda each: f"[{each[0].lower()}{each[0].upper()}]", wild)
+            wild = re.sub(r"[^\W\d_]", _in_any_case, wild)
         # `glob` leaves out folders without permission; that of `Path` lists hidden files as well,
         # and no broken links.
         above = wild.rpartition("/")[0]
         while above:
-            for found in glob.glob(above, root_dir=root):  # noqa: PTH207
-                _check_listable(root / found)
+            for folder in glob.glob(above, root_dir=root):  # noqa: PTH207
+                _check_listable(root / folder)
             above = above.rpartition("/")[0]
         _check_listable(root)
         expression = re.compile(_expression(text), re.IGNORECASE * any_case)
-        paths = sorted(glob.glob(wild, root_dir=root), key=lambda each: each.split("/"))  # noqa: PTH207
-        matches = {path: expression.fullmatch(path) for path in paths}
-        return {root / path: {**values, **m.groupdict()} for path, m in matches.items() if m}
+        found: dict[Path, WordValues] = {}
+        for path in sorted(glob.glob(wild, root_dir=root), key=lambda path: path.split("/")):  # noqa: PTH207
+            match = expression.fullmatch(path)
+            if match:
+                found[root / path] = {**values, **match.groupdict()}
+        return found
+
+
+def _in_any_case(letter: re.Match[str]) -> str:
+    """Return a wildcard for both cases of a letter: "[aA]"."""
+    return f"[{letter[0].lower()}{letter[0].upper()}]"
 
 
 def _filled(text: str, values: WordValues) -> str:
-    """`text` with words replaced whose values are known."""
+    """Replace the words of `text` whose values are known."""
     return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
 
 
 def _expression(text: str) -> str:
-    """The regular expression of a pattern; a word that occurs again refers to the first one."""
+    """Write the regular expression of a pattern; a repeated word refers to the first one."""
     parts = re.split(r"\{(\w+)\}", text)
     for index, part in enumerate(parts):
         if index % 2 == 0:
@@ -107,14 +115,14 @@ def _check_listable(folder: Path) -> None:
 
 
 def what_is_in(folder: Path) -> str:
-    """The first few names in `folder`, for a message."""
+    """Return the first few names in `folder`, for a message."""
     names = sorted(path.name for path in folder.glob("[!.]*"))
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
     return ", ".join(names[:4]) + more if names else "nothing"
 
 
 def in_order(text: str) -> list[tuple[bool, int, str]]:
-    """Key to sort names by, numbers in them by their value: frame_9 comes before frame_10."""
+    """Return a key to sort names by, numbers by their value: frame_9 comes before frame_10."""
     pieces = re.split(r"([0-9]+)", text)
     return [
         (index % 2 == 0, int(piece) if index % 2 else 0, piece)
@@ -122,8 +130,8 @@ def in_order(text: str) -> list[tuple[bool, int, str]]:
     ]
 
 
-class Frame(NamedTuple):
-    """One pair of images and its label.
+class FrameFiles(NamedTuple):
+    """Names the files of one pair of images and its label.
 
     Attributes:
         name: values of the words of the RGB pattern, joined by "_".
@@ -141,7 +149,7 @@ class Frame(NamedTuple):
 
 
 class Patterns(NamedTuple):
-    """Patterns of the three images of a frame; `label` is None for a data set without labels."""
+    """Holds the patterns of the images of a frame; `label` is None where there are no labels."""
 
     rgb: Pattern
     thermal: Pattern
@@ -149,27 +157,27 @@ class Patterns(NamedTuple):
 
     @classmethod
     def of(cls, rgb: str, thermal: str, label: str | None = None) -> Patterns:
-        """Those of the texts of a configuration; InputError for an invalid pattern."""
+        """Make the patterns of a configuration's texts; InputError for an invalid one."""
         of_label = None if label is None else Pattern(label, "dataset.label")
         return cls(Pattern(rgb, "dataset.rgb"), Pattern(thermal, "dataset.thermal"), of_label)
 
     @property
     def packed(self) -> bool:
-        """Whether thermal is the fourth channel of the RGB image."""
+        """Say whether thermal is the fourth channel of the RGB image."""
         return self.rgb.text == self.thermal.text
 
     def __str__(self) -> str:
         rgb, thermal = self.rgb.text, self.thermal.text
         return f"{rgb} of four channels" if self.packed else f"RGB {rgb} with thermal {thermal}"
 
-    def frame(self, root: Path, name: str, values: WordValues) -> Frame:
-        """The files of a frame, whether they exist or not; `values` has every word."""
+    def frame(self, root: Path, name: str, values: WordValues) -> FrameFiles:
+        """Return the files of a frame, whether they exist or not; `values` has every word."""
         label = None if self.label is None else self.label.path(root, values)
         rgb, thermal = (pattern.path(root, values) for pattern in (self.rgb, self.thermal))
-        return Frame(name, values, rgb, thermal, label)
+        return FrameFiles(name, values, rgb, thermal, label)
 
-    def frames(self, root: Path) -> dict[str, Frame]:
-        """Name -> frame of every RGB image below `root`, in the order of the names (9 before 10).
+    def frames(self, root: Path) -> dict[str, FrameFiles]:
+        """Find the frame of every RGB image below `root`, by name, in order (9 before 10).
 
         InputError if two have one name.
         """
@@ -178,8 +186,10 @@ class Patterns(NamedTuple):
             for values in self.rgb.files(root).values()
         ]
         # In a single folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
-        partners = {path for each in every for path in each[3:] if path != each.rgb}
-        frames: dict[str, Frame] = {}
+        partners: set[Path | None] = set()
+        for frame in every:
+            partners.update({frame.thermal, frame.label} - {frame.rgb})
+        frames: dict[str, FrameFiles] = {}
         for frame in every:
             if frame.rgb not in partners and frames.setdefault(frame.name, frame) is not frame:
                 raise InputError(
@@ -189,8 +199,8 @@ class Patterns(NamedTuple):
         return {name: frames[name] for name in sorted(frames, key=in_order)}
 
 
-def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
-    """`Patterns.frames` of a user's configuration.
+def find_frames(root: Path, patterns: Patterns) -> dict[str, FrameFiles]:
+    """Find the frames of a user's configuration, see `Patterns.frames`.
 
     InputError: no {name} in the first pattern, a word that only another one has, no RGB image, no
     thermal image, or two frames that would share a partner.
@@ -198,7 +208,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
     rgb, thermal, label = patterns
     if NAME not in rgb.words:
         raise InputError(f"dataset.rgb: '{rgb.text}' has no {{{NAME}}}, which stands for frames.")
-    partners = [each for each in (thermal, label) if each is not None]
+    partners = [pattern for pattern in (thermal, label) if pattern is not None]
     for pattern in partners:
         for word in pattern.words:
             check_choice(f"{pattern.key}: word of the pattern", word, rgb.words)
@@ -216,7 +226,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
                 "dataset.rgb in which they differ."
             )
         if not any(map(os.path.lexists, paths)) and pattern is thermal:
-            folder = next(each for each in paths[0].parents if each.is_dir())
+            folder = next(parent for parent in paths[0].parents if parent.is_dir())
             raise InputError(
                 f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
                 f"{paths[0]}, but {folder.name} holds {what_is_in(folder)}."
@@ -225,9 +235,12 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
 
 
 def without_rgb(
-    root: Path, partners: Iterable[Pattern | None], frames: Iterable[Frame]
+    root: Path, partners: Iterable[Pattern | None], frames: Iterable[FrameFiles]
 ) -> dict[Path, WordValues]:
-    """Files of the patterns of thermal images and labels that belong to no frame."""
-    used = {path for each in frames for path in each[2:]}
-    found = [each.files(root).items() for each in partners if each is not None]
-    return {path: values for items in found for path, values in items if path not in used}
+    """Find files of the patterns of thermal images and labels that belong to no frame."""
+    used = {path for frame in frames for path in frame[2:]}
+    found: dict[Path, WordValues] = {}
+    for pattern in partners:
+        if pattern is not None:
+            found |= pattern.files(root)
+    return {path: values for path, values in found.items() if path not in used}

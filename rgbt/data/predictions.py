@@ -29,19 +29,19 @@ OVERLAY = "_overlay"
 
 
 class Affixes(NamedTuple):
-    """What is before and after the name of an image in the name of its prediction."""
+    """Says what is before and after the name of an image in the name of its prediction."""
 
     prefix: str = ""
     suffix: str = ""
 
     def file_stem(self, name: str) -> str:
-        """Name of the prediction without ".png"."""
+        """Return the name of the prediction without ".png"."""
         return f"{self.prefix}{name}{self.suffix}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
-    """What the user states about the files of predictions.
+    """Holds what the user states about the files of predictions.
 
     `form`: "index": the stored numbers are classes; "colour": the colours shown are. `palette`: of
     the data set, or of a YAML file with that key, such as a file of conf/dataset.
@@ -65,7 +65,7 @@ class PredictionReader:
 
     @cached_property
     def known(self) -> tuple[int, ...]:
-        """The colour of each class as one number; InputError for a file without colours."""
+        """Return the colour of each class as one number; InputError for a file without colours."""
         palette, colours = self.options.palette, cast(Any, self.colours)
         if palette != "dataset":
             content = read_yaml(Path(palette).expanduser())
@@ -81,7 +81,7 @@ class PredictionReader:
 
     @cached_property
     def codes(self) -> LabelCodes:
-        """The class of each stored number or colour; InputError for two of one colour."""
+        """Return the class of each stored number or colour; InputError for two of one colour."""
         if self.options.form == "index":
             return LabelCodes({index: index for index in range(len(self.classes))})
         if len(set(self.known)) < len(self.known):
@@ -91,7 +91,7 @@ class PredictionReader:
         return LabelCodes(codes, f"palette={self.options.palette}", of_colours=True)
 
     def read(self, path: Path) -> Array:
-        """Class indices (H, W) uint8, all below K.
+        """Read class indices (H, W) uint8, all below K.
 
         Raises:
             InputError: not readable, another format than stated, or an unknown index or colour.
@@ -119,5 +119,5 @@ class PredictionReader:
 
 
 def prediction_paths(folder: Path, names: Iterable[str], affixes: Affixes) -> dict[str, Path]:
-    """Name of an image -> the file of its prediction, whether it exists or not."""
+    """Return the file of the prediction of each image, whether it exists or not."""
     return {name: folder / f"{affixes.file_stem(name)}.png" for name in names}

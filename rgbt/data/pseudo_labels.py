@@ -35,7 +35,7 @@ FULL = 65535
 
 
 class Manifest(TypedDict, total=False):
-    """Content of ``pseudo_labels.json``."""
+    """Describes the content of ``pseudo_labels.json``."""
 
     format: Required[str]
     teacher: str  # a run's key, or a file
@@ -57,7 +57,7 @@ class Manifest(TypedDict, total=False):
 
 
 class PseudoLabels:
-    """A complete folder of pseudo-labels; InputError if there is none, or an incomplete one.
+    """Reads a complete folder of pseudo-labels; InputError if there is none, or an incomplete one.
 
     `manifest` is a `Manifest`.
     """
@@ -81,11 +81,11 @@ class PseudoLabels:
         self.digest: str = self.manifest["digest"]
 
     def missing(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of the names that have no pseudo-label here."""
+        """Return those of the names that have no pseudo-label here."""
         return tuple(name for name in names if not label_path(self.folder, name).is_file())
 
     def read(self, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Label (H, W) uint8, 255 = no label, and confidence (H, W) from 0 to 1, of one image.
+        """Read label (H, W) uint8, 255 = no label, and confidence (H, W) from 0 to 1.
 
         InputError: a file is missing, cannot be decoded, or holds something else.
         """
@@ -106,17 +106,17 @@ class PseudoLabels:
 
 
 def label_path(folder: Path, name: str) -> Path:
-    """The file of the label of `name`."""
+    """Return the file of the label of `name`."""
     return folder / "labels" / f"{name}.png"
 
 
 def confidence_path(folder: Path, name: str) -> Path:
-    """The file of the confidence of `name`."""
+    """Return the file of the confidence of `name`."""
     return folder / "confidence" / f"{name}.png"
 
 
 class PseudoLabelled(DatasetWrapper):
-    """A data set whose labels, perhaps with confidences, are the pseudo-labels of a folder.
+    """Replaces labels of a data set by pseudo-labels of a folder, perhaps with confidences.
 
     InputError: the folder is not complete, or its classes differ from those of the data set.
     """
@@ -135,7 +135,7 @@ class PseudoLabelled(DatasetWrapper):
             )
 
     def read(self, name: str) -> Sample:
-        """The sample with its pseudo-label; InputError if it has none, or one of another size."""
+        """Read the sample with its pseudo-label; InputError for none, or one of another size."""
         sample = self.source.read(name)
         label, confidence = self.labels.read(name)
         if label.shape != sample.thermal.shape:
@@ -146,16 +146,16 @@ class PseudoLabelled(DatasetWrapper):
         return replace(sample, label=label, confidence=confidence if self.with_confidence else None)
 
     def label(self, name: str) -> NDArray[np.uint8]:
-        """The pseudo-label alone."""
+        """Read the pseudo-label alone."""
         return self.labels.read(name)[0]
 
 
 class Unlabelled(DatasetWrapper):
-    """A data set without its labels."""
+    """Reads a data set without its labels."""
 
     def read(self, name: str) -> Sample:
-        """The sample without label and confidence."""
+        """Read the sample without label and confidence."""
         return replace(self.source.read(name), label=None, confidence=None)
 
     def label(self, name: str) -> None:
-        """None: there are no labels."""
+        """Return None: there are no labels."""

@@ -12,12 +12,19 @@ from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
-from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.patterns import FrameFiles, Patterns
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
-CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
-PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
+# Class -> its colour, in the order of the indices.
+COLOURS = {
+    "background": (0, 0, 0),
+    "fire_extinguisher": (0, 0, 255),
+    "backpack": (0, 255, 0),
+    "hand_drill": (255, 0, 0),
+    "survivor": (255, 255, 255),
+}
+CLASSES, PALETTE = tuple(COLOURS), tuple(COLOURS.values())
 PATTERNS = tuple(f"{{part}}/{kind}/{{name}}.png" for kind in ("rgb", "thermal", "labels"))
 PARTS = ("train", "test")
 
@@ -26,13 +33,13 @@ BAG = re.compile(r"(?:^|_)bag(\d+)_")
 
 
 def bag_of(name: str) -> int | None:
-    """Number of the recording in `name`; None if there is none."""
+    """Return the number of the recording in `name`; None if there is none."""
     match = BAG.search(name)
     return int(match[1]) if match else None
 
 
 class PST900(FileDataset):
-    """Underground RGB-thermal pairs with labels, in the layout of the PST900 archive.
+    """Reads underground RGB-thermal pairs with labels, in the layout of the PST900 archive.
 
     Layout (NAME as in 58_bag21_rect_rgb_frame0000000440, the same in each folder):
     {train,test}/{rgb,thermal,labels}/NAME.png; thermal_raw and depth are not read.
@@ -83,7 +90,7 @@ class PST900(FileDataset):
                 self._part_of.setdefault(values["name"], []).append(part)
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Names of a split, sorted; InputError if it lacks a bag of `val_bags`."""
+        """Return the names of a split, sorted; InputError if it lacks a bag of `val_bags`."""
         names = {
             part: [n for n in sorted(self._part_of) if part in self._part_of[n]] for part in PARTS
         }
@@ -94,13 +101,13 @@ class PST900(FileDataset):
             if bag not in bags:
                 raise InputError(
                     f"dataset.val_bags: the training part of {self.root} has no bag {bag}; its "
-                    f"bags are {sorted(each for each in bags if each is not None)}."
+                    f"bags are {sorted(number for number in bags if number is not None)}."
                 )
         is_val = split == "val"
         return tuple(name for name in names["train"] if (bag_of(name) in self.val_bags) == is_val)
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError if no part or both have it."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`; InputError if no part or both have it."""
         parts = self._part_of.get(name, [])
         if len(parts) != 1:
             reason = "both train and test have" if parts else "neither train nor test has"
@@ -108,12 +115,12 @@ class PST900(FileDataset):
         return self.patterns.frame(self.root, name, {"name": name, "part": parts[0]})
 
     def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
-        """None: it is dark underground at any time."""
+        """Return None: it is dark underground at any time."""
 
     def repeats(self, split: str) -> bool:
-        """The validation split is the test part, unless it has bags of its own."""
+        """Say that the validation split is the test part, unless it has bags of its own."""
         return split == "val" and not self.val_bags
 
     def unused(self, lists: SplitNames) -> set[Path]:
-        """Files of the layout that belong to no image of a split."""
+        """Return files of the layout that belong to no image of a split."""
         return {path for path in super().unused(lists) if path.parts[-3] in PARTS}

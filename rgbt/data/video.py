@@ -19,7 +19,7 @@ from rgbt.data.images import PairReader, Range
 from rgbt.data.labels import LabelCodes, LabelValue, label_codes, painted
 from rgbt.data.patterns import (
     NAME,
-    Frame,
+    FrameFiles,
     Pattern,
     Patterns,
     find_frames,
@@ -37,62 +37,36 @@ Sequences = tuple[tuple[str, ...], ...]
 
 VIDEO = "video"  # the word of the patterns that names one
 
-CLASSES = (
-    "background",
-    "car",
-    "bus",
-    "motorcycle",
-    "bicycle",
-    "pedestrian",
-    "motorcyclist",
-    "bicyclist",
-    "cart",
-    "bench",
-    "umbrella",
-    "box",
-    "pole",
-    "street_lamp",
-    "traffic_light",
-    "traffic_sign",
-    "car_stop",
-    "color_cone",
-    "sky",
-    "road",
-    "sidewalk",
-    "curb",
-    "vegetation",
-    "terrain",
-    "building",
-    "ground",
-)
-PALETTE = (
-    (0, 0, 0),
-    (0, 0, 142),
-    (0, 60, 100),
-    (0, 0, 230),
-    (119, 11, 32),
-    (255, 0, 0),
-    (0, 139, 139),
-    (255, 165, 150),
-    (192, 64, 0),
-    (211, 211, 211),
-    (100, 33, 128),
-    (117, 79, 86),
-    (153, 153, 153),
-    (190, 122, 222),
-    (250, 170, 30),
-    (220, 220, 0),
-    (222, 142, 35),
-    (205, 155, 155),
-    (70, 130, 180),
-    (128, 64, 128),
-    (244, 35, 232),
-    (0, 0, 70),
-    (107, 142, 35),
-    (152, 251, 152),
-    (70, 70, 70),
-    (110, 80, 100),
-)
+# Class -> its colour, in the order of the indices.
+COLOURS = {
+    "background": (0, 0, 0),
+    "car": (0, 0, 142),
+    "bus": (0, 60, 100),
+    "motorcycle": (0, 0, 230),
+    "bicycle": (119, 11, 32),
+    "pedestrian": (255, 0, 0),
+    "motorcyclist": (0, 139, 139),
+    "bicyclist": (255, 165, 150),
+    "cart": (192, 64, 0),
+    "bench": (211, 211, 211),
+    "umbrella": (100, 33, 128),
+    "box": (117, 79, 86),
+    "pole": (153, 153, 153),
+    "street_lamp": (190, 122, 222),
+    "traffic_light": (250, 170, 30),
+    "traffic_sign": (220, 220, 0),
+    "car_stop": (222, 142, 35),
+    "color_cone": (205, 155, 155),
+    "sky": (70, 130, 180),
+    "road": (128, 64, 128),
+    "sidewalk": (244, 35, 232),
+    "curb": (0, 0, 70),
+    "vegetation": (107, 142, 35),
+    "terrain": (152, 251, 152),
+    "building": (70, 70, 70),
+    "ground": (110, 80, 100),
+}
+CLASSES, PALETTE = tuple(COLOURS), tuple(COLOURS.values())
 LISTS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
 
 # The frame number of MVSeg is the last four digits before the letter.
@@ -114,7 +88,7 @@ LAYOUTS = tuple(
 
 
 class VideoDataset(FileDataset):
-    """Base of data sets of videos; a subclass finds the frames and calls `add`.
+    """Reads the frames of videos, which a subclass finds and passes to `add`.
 
     `names` of a split are its labelled frames, for training and evaluation; all frames where the
     split has no label. `sequences` are all frames, for temporal consistency.
@@ -128,7 +102,7 @@ class VideoDataset(FileDataset):
 
     def add(
         self,
-        frames: Iterable[tuple[int, Frame]],
+        frames: Iterable[tuple[int, FrameFiles]],
         partners: Sequence[Pattern | None],
         lists: dict[str, str] | None,
         gaps: Gaps,
@@ -141,9 +115,9 @@ class VideoDataset(FileDataset):
         """
         self._partners, self.gaps, self._is_listed = partners, gaps, lists is not None
         self.splits = {"test": "all videos"} if lists is None else dict(lists)
-        self.frames: dict[str, Frame] = {}
+        self.frames: dict[str, FrameFiles] = {}
         videos: dict[str, dict[int, str]] = {}
-        for number, frame in sorted(frames, key=lambda each: each[0]):
+        for number, frame in sorted(frames, key=lambda numbered: numbered[0]):
             # A broken link is kept; reading it says where it leads.
             has_label = frame.label is not None and os.path.lexists(frame.label)
             self.frames[frame.name] = frame if has_label else frame._replace(label=None)
@@ -157,7 +131,7 @@ class VideoDataset(FileDataset):
         self.videos = {video: videos[video] for video in sorted(videos, key=in_order)}
 
     def videos_of(self, split: str) -> tuple[str, ...]:
-        """Names of the videos of a split; InputError if one of them is not there, or empty."""
+        """Return the videos of a split; InputError if one of them is not there, or empty."""
         self.check_split(split)
         names = dict.fromkeys(self.lines(split) if self._is_listed else self.videos)
         for name in names:
@@ -169,13 +143,13 @@ class VideoDataset(FileDataset):
         return tuple(names)
 
     def all_names(self, split: str) -> tuple[str, ...]:
-        """Names of all frames of a split, labelled or not."""
+        """Return the names of all frames of a split, labelled or not."""
         return tuple(
             name for video in self.videos_of(split) for name in self.videos[video].values()
         )
 
     def sequences(self, split: str) -> Sequences:
-        """Names of all frames of a split, one tuple for each run without a gap.
+        """Return the names of all frames of a split, one tuple for each run without a gap.
 
         InputError: a video is empty, or, with gaps="refuse", lacks a number or an image.
         """
@@ -189,18 +163,18 @@ class VideoDataset(FileDataset):
         return tuple(run for video in videos for run in consecutive(self.videos[video]))
 
     def listed(self, split: str) -> tuple[str, ...]:
-        """Labelled frames of a split, video by video; all frames where none is labelled."""
+        """Return the labelled frames of a split, video by video; all where none is labelled."""
         every = self.all_names(split)
         return tuple(name for name in every if self.frame(name).label is not None) or every
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; no label where there was none when the folder was listed."""
+    def frame(self, name: str) -> FrameFiles:
+        """Return the files of `name`; no label where there was none when the folder was listed."""
         if name not in self.frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self.frames[name]
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether the video of each name is in a list of a split "..._night", or "..._day".
+        """Say whether the video of each name is in a list of a split "..._night", or "..._day".
 
         A video in neither list is a day video where its split has a list of the night alone. None
         if a video is in no list at all.
@@ -219,30 +193,33 @@ class VideoDataset(FileDataset):
         return tuple(_video_of(self.frames[name]) in at_night for name in names)
 
     def fingerprint(self) -> str:
-        """See `hash_of_files`; of all frames, labelled or not."""
+        """Return `hash_of_files` of all frames, labelled or not."""
         return hash_of_files({s: self.all_names(s) for s in self.splits}, self.files)
 
     def unused(self, lists: SplitNames) -> Collection[Path]:  # noqa: ARG002 - as every data set
-        """None: frames without a label belong to a video, for the rest see `own_problems`."""
+        """Return nothing: unlabelled frames belong to a video, for the rest see `own_problems`."""
         return ()
 
     def own_problems(self, lists: SplitNames) -> list[str]:
-        """Frames without an RGB image, or without a thermal image, of any split."""
-        return [f"{each}." for each in self._unpaired(None, set().union(*lists.values()))]
+        """Return frames without an RGB image, or without a thermal image, of any split."""
+        read = {name for names in lists.values() for name in names}
+        return [f"{problem}." for problem in self._unpaired(None, read)]
 
     def _gaps(self, videos: Iterable[str]) -> list[str]:
-        """Numbers that are missing; frames are apart by the smallest step of all videos."""
+        """Say which numbers are missing; frames are apart by the smallest step of all videos."""
         steps = [b - a for frames in self.videos.values() for a, b in pairwise(frames)]
-        return [
-            f"video '{video}' lacks frame {a + min(steps)}, which should follow "
-            f"'{self.videos[video][a]}'"
-            for video in videos
-            for a, b in pairwise(self.videos[video])
-            if b - a != min(steps)
-        ]
+        step = min(steps, default=1)
+        problems = []
+        for video in videos:
+            for number, after in pairwise(self.videos[video]):
+                if after - number != step:
+                    before = self.videos[video][number]
+                    lacks = f"video '{video}' lacks frame {number + step}"
+                    problems.append(f"{lacks}, which should follow '{before}'")
+        return problems
 
     def _unpaired(self, videos: Collection[str] | None, read: Collection[str] = ()) -> list[str]:
-        """What videos lack (None: all), as beginnings of sentences, but for frames in `read`."""
+        """Begin sentences that say what videos lack (None: all), but for frames in `read`."""
         no_rgb = [
             f"{path} has no RGB image"
             for path, v in without_rgb(self.root, self._partners, self.frames.values()).items()
@@ -257,12 +234,12 @@ class VideoDataset(FileDataset):
         return no_rgb + no_thermal
 
 
-def _video_of(frame: Frame) -> str:
+def _video_of(frame: FrameFiles) -> str:
     return frame.values.get(VIDEO, "")
 
 
 class Video(VideoDataset):
-    """Numbered RGB-thermal frames in any folder whose paths follow patterns.
+    """Reads numbered RGB-thermal frames in any folder whose paths follow patterns.
 
     A pattern is a path below the root with words in braces (`rgbt.data.patterns`): {name} is the
     frame, whose last number counts, and {video} its video, if there are several. The name of a
@@ -293,7 +270,7 @@ class Video(VideoDataset):
         super().__init__(*common, background=background, unscored=unscored)
         self.codes = label_codes(classes, ids, None, ignored)
         self.follow(rgb, thermal, label, thermal_range)
-        frames: list[tuple[int, Frame]] = []
+        frames: list[tuple[int, FrameFiles]] = []
         for frame in find_frames(self.root, self.patterns).values():
             found = re.findall(r"\d+", frame.values[NAME])
             if not found:
@@ -303,7 +280,7 @@ class Video(VideoDataset):
 
 
 class MVSeg(VideoDataset):
-    """RGB-thermal videos with about five labelled frames each, in the layout of the MVSeg archive.
+    """Reads RGB-thermal videos with few labelled frames, in the layout of the MVSeg archive.
 
     Layout: {train,val,test,test_day,test_night}.txt, one name of a video per line, and
     data/VIDEO/visible/NNNNNv.jpg, data/VIDEO/infrared/NNNNNi.jpg (or png),
@@ -317,7 +294,9 @@ class MVSeg(VideoDataset):
     """
 
     # JPEG stores grey images with three channels that may differ by rounding.
-    images = PairReader(layouts=tuple(each._replace(label=None) for each in LAYOUTS), most_tint=8)
+    images = PairReader(
+        layouts=tuple(layout._replace(label=None) for layout in LAYOUTS), most_tint=8
+    )
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -340,9 +319,11 @@ class MVSeg(VideoDataset):
         self.codes = LabelCodes({**{value: value for value in range(num_classes)}, IGNORE: rest})
         if not (self.root / "data").is_dir():
             raise InputError(f"dataset.root: '{root}' does not hold the folder data.")
-        frames: list[tuple[int, Frame]] = []
-        found = [each.frames(self.root) for each in LAYOUTS]
-        for frame in (found[0] | found[1]).values():
+        frames: list[tuple[int, FrameFiles]] = []
+        found: dict[str, FrameFiles] = {}
+        for layout in LAYOUTS:
+            found |= layout.frames(self.root)
+        for frame in found.values():
             stem = frame.values[NAME]
             match = STEM.fullmatch(stem)
             if match is None:
@@ -354,12 +335,12 @@ class MVSeg(VideoDataset):
             thermal = next((path for path in others if os.path.lexists(path)), frame.thermal)
             number = int(match[2]) + RECORDING_GAP * int(match[1] or 0)
             frames.append((number, frame._replace(thermal=thermal)))
-        partners = [each for layout in LAYOUTS for each in layout[1:]]
+        partners = [pattern for layout in LAYOUTS for pattern in layout[1:]]
         self.add(frames, partners, lists, gaps)
 
 
 class FramesInOrder(DatasetWrapper):
-    """All frames of the sequences of `split`, instead of the labelled ones in the order of a list.
+    """Names all frames of the sequences of `split`, instead of the labelled ones of a list.
 
     Attributes:
         sequences: names of each sequence, in the order of their frames; two or more each.
@@ -376,29 +357,33 @@ class FramesInOrder(DatasetWrapper):
             every = reader.sequences(split)
         else:
             every = sequences_of_names(source.names(split))
-        self.sequences = tuple(each for each in every if len(each) > 1)
-        self.alone = sum(len(each) == 1 for each in every)
+        self.sequences = tuple(sequence for sequence in every if len(sequence) > 1)
+        self.alone = len(every) - len(self.sequences)
         if not self.sequences:
             raise InputError(
                 f"split '{split}' of {source.name} has no two consecutive frames among its "
                 f"{self.alone} frame(s); frames=video requires names whose numbers follow each "
                 "other, such as 00101D and 00102D."
             )
-        self._frames = tuple(name for each in self.sequences for name in each)
+        self._frames = tuple(name for sequence in self.sequences for name in sequence)
         self._split = split
 
     @property
     def pairs(self) -> dict[str, str]:
-        """Second frame -> the frame before it."""
-        return {later: name for each in self.sequences for name, later in pairwise(each)}
+        """Return the frame before each second frame."""
+        before: dict[str, str] = {}
+        for sequence in self.sequences:
+            for name, later in pairwise(sequence):
+                before[later] = name
+        return before
 
     def names(self, split: str) -> tuple[str, ...]:
-        """All frames in order; of another split as the source has them."""
+        """Return all frames in order; of another split as the source has them."""
         return self._frames if split == self._split else self.source.names(split)
 
 
 def sequences_of_names(names: Iterable[str]) -> Sequences:
-    """Runs of names that are equal but for their last number, and whose numbers are consecutive.
+    """Find runs of names that are equal but for their last number, by consecutive numbers.
 
     Consecutive are numbers that differ by the smallest step that occurs between such names, so that
     every fifth frame of a video is a sequence too. Names without a number are alone.
@@ -416,7 +401,7 @@ def sequences_of_names(names: Iterable[str]) -> Sequences:
 
 
 def consecutive(frames: Mapping[int, str]) -> Iterator[tuple[str, ...]]:
-    """Frames by number, cut where these are further apart than the smallest step."""
+    """Cut frames by number where these are further apart than the smallest step."""
     numbers = sorted(frames)
     steps = [later - number for number, later in pairwise(numbers)]
     usual = min(steps, default=1)

@@ -33,7 +33,7 @@ SLACK = 1e-6
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of a pinhole camera for images of `height` x `width` pixels.
+    """Holds intrinsics of a pinhole camera for images of `height` x `width` pixels.
 
     Focal lengths along a row and a column, column and row of the principal point, in pixels, whose
     centres lie at whole numbers. InputError for a principal point outside the image: then these are
@@ -56,7 +56,7 @@ class Camera:
             )
 
     def matrix(self, image_hw: tuple[int, int]) -> Tensor:
-        """(3, 3) float64, the calibration matrix K for images of `image_hw` (height, width).
+        """Return the calibration matrix K, (3, 3) float64, for images of `image_hw`.
 
         Images of another size but the same aspect, to a pixel, are the same picture resized: focal
         lengths scale by s, and the principal point as pixel centres do, c' = (c + 0.5) s - 0.5. A
@@ -75,7 +75,7 @@ class Camera:
 
 
 def homography(angles: Tensor, matrix: Tensor, order: Order) -> Tensor:
-    """K R K^-1: pixels of the first frame to pixels of the view, w > 0 in front of the camera.
+    """Return K R K^-1, from pixels of the first frame to the view's; w > 0 in front of the camera.
 
     `angles` (B, 3) float are degrees, right-handed: yaw about y (down), pitch about x (right), roll
     about z (ahead); `matrix` (3, 3) is K of `Camera.matrix`. (B, 3, 3) float64 on their device.
@@ -98,7 +98,7 @@ def homography(angles: Tensor, matrix: Tensor, order: Order) -> Tensor:
 
 
 def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -> Tensor:
-    """An upright rectangle of the view, inside the picture of the first frame and the frame.
+    """Find an upright rectangle of the view, inside the picture of the first frame and the frame.
 
     `homography` (B, 3, 3) float64: pixels of the first frame to pixels of the view, w > 0 in front
     of the camera. "corners", as released, may hold a few pixels that the first frame does not show
@@ -111,7 +111,7 @@ def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -
 
 
 def _by_corners(homography: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """Second extremes of the mapped corner pixels, truncated, clamped; less the last pixel."""
+    """Take second extremes of the mapped corner pixels, truncated, clamped, less the last one."""
     height, width = image_hw
     last = homography.new_tensor([width - 1.0, height - 1.0])
     grid = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
@@ -123,7 +123,7 @@ def _by_corners(homography: Tensor, image_hw: tuple[int, int]) -> Tensor:
 
 
 def _largest(homography: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """The largest rectangle, by the points where constraints meet: no search, no grid.
+    """Find the largest rectangle by the points where constraints meet: no search, no grid.
 
     What of the view shows the first frame is a convex polygon, bounded by the four sides of the
     frame and the four lines that the sides of the first frame became: a side is a line l with

@@ -28,7 +28,7 @@ Flow = NDArray[np.float32]
 
 
 class FrameFlow(NamedTuple):
-    """The estimated motion between two frames, for every pixel of the second one.
+    """Holds the estimated motion between two frames, for every pixel of the second one.
 
     `flow` leads to the first frame; `used` (H, W) is whether the flows of both directions agree and
     the point is inside the first frame.
@@ -38,24 +38,23 @@ class FrameFlow(NamedTuple):
     used: NDArray[np.bool_]
 
     def source(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns (H, W) of the nearest pixels of the first frame; -1 where not used."""
-        places = np.indices(self.used.shape) + np.moveaxis(self.flow, -1, 0)
-        rows, columns = (
-            np.where(self.used, np.rint(place).astype(np.int64).clip(0, side - 1), -1)
-            for place, side in zip(places, self.used.shape, strict=True)
-        )
-        return rows, columns
+        """Return rows and columns (H, W) of the nearest pixels of the first frame, or -1."""
+        height, width = self.used.shape
+        rows, columns = np.indices(self.used.shape) + np.moveaxis(self.flow, -1, 0)
+        rows = np.rint(rows).astype(np.int64).clip(0, height - 1)
+        columns = np.rint(columns).astype(np.int64).clip(0, width - 1)
+        return np.where(self.used, rows, -1), np.where(self.used, columns, -1)
 
 
 def gray_of(rgb: NDArray[np.uint8]) -> Gray:
-    """(H, W) grey levels of RGB (H, W, 3)."""
+    """Convert RGB (H, W, 3) to grey levels (H, W)."""
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def frame_flow(
     first: dict[str, Gray], second: dict[str, Gray], source: FlowSource = "both"
 ) -> FrameFlow:
-    """The motion between two frames; InputError where sizes differ or are below `SMALLEST`.
+    """Estimate the motion between two frames; InputError for sizes that differ or are too small.
 
     `first` and `second` are grey levels (H, W) by the name of the image, "rgb" and "thermal".
     """
@@ -72,13 +71,13 @@ def frame_flow(
 
 
 def estimate(start: Gray, end: Gray) -> Flow:
-    """Flow from `start` (H, W) to `end` by dense inverse search; errors as of `frame_flow`.
+    """Estimate flow from `start` (H, W) to `end` by dense inverse search; errors as `frame_flow`.
 
     Source: Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, in OpenCV
     with its preset "medium".
     """
     if start.shape != end.shape or min(start.shape) < SMALLEST:
-        sizes = [" x ".join(map(str, each.shape)) for each in (start, end)]
+        sizes = [" x ".join(map(str, image.shape)) for image in (start, end)]
         raise InputError(f"flow: expected one size of at least {SMALLEST} pixels, got {sizes}.")
     # OpenCV's type stubs lack this function.
     search = vars(cv2)["DISOpticalFlow_create"](cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -86,7 +85,7 @@ def estimate(start: Gray, end: Gray) -> Flow:
 
 
 def disagreement(flow: Flow, back: Flow) -> NDArray[np.float32]:
-    """How far `back` misses the start of `flow`, relative to the limit: (H, W), inf outside.
+    """Compute how far `back` misses the start of `flow`, by the limit: (H, W), inf outside.
 
         |w(x) + w'(x + w(x))|^2 / (0.01 (|w|^2 + |w'|^2) + 0.5)
 

@@ -10,13 +10,13 @@ STRIDE = 32
 
 
 def padded_hw(image_hw: tuple[int, int], multiple: int = STRIDE) -> tuple[int, int]:
-    """(height, width), each rounded up to a multiple of `multiple`."""
+    """Round height and width up to multiples of `multiple`."""
     height, width = image_hw
     return -(-height // multiple) * multiple, -(-width // multiple) * multiple
 
 
 def pad_to(tensor: Tensor, hw: tuple[int, int], value: float = 0.0) -> Tensor:
-    """`tensor` (..., H, W) padded with `value` at the bottom and right to `hw`."""
+    """Pad `tensor` (..., H, W) with `value` at the bottom and right to `hw`."""
     height, width = tensor.shape[-2:]
     if isinstance(height, int) and (height, width) == hw:  # not of a graph for any size
         return tensor

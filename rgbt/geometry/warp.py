@@ -30,7 +30,7 @@ NOWHERE = -1e6
 
 
 def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) of the padded frame in which points are normalised.
+    """Return (height, width) of the padded frame in which points are normalised.
 
     `grid_sample` finds whole pixels exactly at such sizes alone: (x + 0.5) / W is not rounded.
     """
@@ -39,7 +39,7 @@ def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
 
 
 def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """(B, H, W, 2) of points (B, H, W) in pixels: -1 and 1 are the edges of the padded frame."""
+    """Normalise points (B, H, W): -1 and 1 are the edges of the padded frame; (B, H, W, 2)."""
     sides = reversed(powers_of_two(image_hw))
     # A product with a power of two is exact, so that one rounding is left.
     parts = [
@@ -51,7 +51,7 @@ def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where every pixel of the second frame comes from.
+    """Says where every pixel of the second frame comes from, and warps what belongs to it.
 
     Attributes:
         homography: (B, 3, 3) float64, pixels of the first frame to pixels of the canvas, w > 0 in
@@ -70,7 +70,7 @@ class Warp:
         check_shape("rectangle", self.rectangle, "B S", B=len(self.homography), S=4)
 
     def resized(self, image_hw: tuple[int, int]) -> Warp:
-        """The same view for the same frames at another size, (height, width)."""
+        """Return the same view for the same frames at another size, (height, width)."""
         if image_hw == self.image_hw:
             return self
         sy, sx = (new / old for new, old in zip(image_hw, self.image_hw, strict=True))
@@ -85,7 +85,7 @@ class Warp:
         )
 
     def halved(self) -> Warp:
-        """The same view for frames whose pixels cover 2x2 pixels of these, as `halved_mean`.
+        """Return the same view for frames whose pixels cover 2x2 pixels of these, as `halved_mean`.
 
         At odd sizes, both frames end one row or column later, so that pixels keep their places.
         """
@@ -97,7 +97,7 @@ class Warp:
         return even.resized((rows // 2, columns // 2))
 
     def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
-        """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
+        """Interpolate `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
 
         Where a point falls on a pixel, that pixel's value comes back bit by bit. `levels` 255
         rounds to 8-bit levels after each interpolation, without a gradient.
@@ -111,7 +111,7 @@ class Warp:
         return sampled.to(values.dtype)
 
     def nearest(self, values: Tensor, outside: float) -> Tensor:
-        """The nearest of `values` (B, H, W) or (B, C, H, W), any dtype; `outside` where none."""
+        """Take the nearest of `values` (B, H, W) or (B, C, H, W), any dtype; `outside` if none."""
         self._check(values, "B H W" if values.dim() == 3 else "B C H W")
         index, inside = self._pixels
         flat = values.reshape(len(values), -1, index.shape[-1])
@@ -119,11 +119,11 @@ class Warp:
         return picked.masked_fill_(~inside[:, None], outside).view(values.shape)
 
     def inside(self) -> Tensor:
-        """(B, H, W) bool: the pixel shows a point within the outline of the first frame."""
+        """Say whether a pixel shows a point within the outline of the first frame; (B, H, W)."""
         return self._pixels[1].view(-1, *self.image_hw)
 
     def moved(self, points_yx: Tensor) -> Tensor:
-        """Pixel of the second frame nearest to that of the first; (B, 2) int64 (row, column)."""
+        """Return the pixel (row, column) of the second frame nearest to each point; (B, 2)."""
         row, column = points_yx.to(self.homography.device, torch.float64).unbind(1)
         points = torch.stack([column, row, torch.ones_like(row)], 1)
         x, y, w = (self.homography @ points[..., None])[..., 0].unbind(1)
@@ -140,20 +140,20 @@ class Warp:
 
     @cached_property
     def _cut(self) -> tuple[Tensor, Tensor]:
-        """Canvas columns (B, W) and rows (B, H) of the second frame's pixel centres, float64."""
+        """Return canvas columns (B, W) and rows (B, H) of the second frame's pixels, float64."""
         left, top, right, bottom = self.rectangle[..., None].unbind(1)
         columns, rows = (at + 0.5 for at in self._whole())
         height, width = self.image_hw
         return left + columns * ((right - left) / width), top + rows * ((bottom - top) / height)
 
     def _whole(self) -> list[Tensor]:
-        """Columns (1, W) and rows (1, H), float64."""
+        """Return columns (1, W) and rows (1, H), float64."""
         device = self.rectangle.device
         sides = reversed(self.image_hw)
         return [torch.arange(side, dtype=torch.float64, device=device)[None] for side in sides]
 
     def _source(self, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """x, y (B, H, W) float32 in the first frame of canvas points; NaN behind the camera."""
+        """Return x, y (B, H, W) in the first frame of canvas points; NaN behind the camera."""
         m = torch.linalg.inv_ex(self.homography).inverse.float()[..., None, None]
         columns, rows = columns.float()[:, None, :], rows.float()[:, :, None]
         x, y, w = (m[:, k, 0] * columns + (m[:, k, 1] * rows + m[:, k, 2]) for k in range(3))
@@ -162,7 +162,7 @@ class Warp:
 
     @cached_property
     def _composed(self) -> tuple[Tensor, Tensor, Tensor]:
-        """x, y (B, H, W) in the first frame of the second's pixels, and whether they are there."""
+        """Return x, y (B, H, W) in the first frame of the second's pixels, and whether inside."""
         points = self._cut
         if self.resampling == "twice":  # what OpenCV's nearest resize takes from the rectangle
             left, top, right, bottom = self.rectangle[..., None].unbind(1)
@@ -171,13 +171,14 @@ class Warp:
         x, y = self._source(*points)
         height, width = self.image_hw
         inside = x >= -0.5
-        for each in (x <= width - 0.5, y >= -0.5, y <= height - 0.5):
-            inside &= each
+        inside &= x <= width - 0.5
+        inside &= y >= -0.5
+        inside &= y <= height - 0.5
         return x, y, inside
 
     @cached_property
     def _pixels(self) -> tuple[Tensor, Tensor]:
-        """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
+        """Return the flat index of the nearest pixel, and whether there is one; (B, H W) each."""
         x, y, inside = self._composed
         height, width = self.image_hw
         column, row = (
@@ -188,7 +189,7 @@ class Warp:
 
     @cached_property
     def _grids(self) -> list[Tensor]:
-        """What to sample one after the other: (B, H, W, 2) float32, see `normalised`."""
+        """Return grids to sample one after the other: (B, H, W, 2) float32, see `normalised`."""
         height, width = self.image_hw
         if self.resampling == "once":
             x, y, inside = self._composed
@@ -206,15 +207,17 @@ class Warp:
 
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """First pixel + floor(i * cut / size)."""
-    # OpenCV's rounding is used, which decides where the product is whole, as at 576 of 640 pixels.
+    """Return first pixel + floor(i * cut / size), with OpenCV's rounding.
+
+    The rounding matters where the product is whole, as at 576 of 640 pixels.
+    """
     step = 1 / (pixels.shape[-1] / (high - low))
     first = low + 0.5
     return first.floor() + (first.frac() + pixels * step).floor()
 
 
 def halved_mean(values: Tensor) -> Tensor:
-    """(B, C, H, W) float -> (B, C, ceil(H / 2), ceil(W / 2)), means of 2x2 pixels of what exists.
+    """Average 2x2 pixels of what exists: (B, C, H, W) float -> (B, C, ceil(H / 2), ceil(W / 2)).
 
     It can be differentiated once. `avg_pool2d` takes three times the CPU time.
     """
@@ -222,6 +225,8 @@ def halved_mean(values: Tensor) -> Tensor:
 
 
 class _Mean(torch.autograd.Function):
+    """Averages 2x2 pixels of (..., H, W), H and W even."""
+
     @staticmethod
     def forward(_: Any, values: Tensor) -> Tensor:
         rows = values[..., ::2, :] + values[..., 1::2, :]
@@ -234,25 +239,27 @@ class _Mean(torch.autograd.Function):
 
 
 def halved_all(mask: Tensor) -> Tensor:
-    """(B, H, W) bool -> (B, ceil(H / 2), ceil(W / 2)), whether all of 2x2 pixels are true."""
+    """Say whether all of 2x2 pixels are true: (B, H, W) bool -> (B, ceil(H / 2), ceil(W / 2))."""
     a, b, c, d = _corners(mask)
     return a & b & c & d
 
 
 def halved_label(label: Tensor) -> Tensor:
-    """(B, H, W) int64 -> (B, ceil(H / 2), ceil(W / 2)): the class of 2x2 pixels, 255 of several."""
+    """Return the class of 2x2 pixels, 255 of several: (B, ceil(H / 2), ceil(W / 2))."""
     a, b, c, d = _corners(label)
     return a.where((a == b) & (a == c) & (a == d), IGNORE)
 
 
 def _corners(values: Tensor) -> list[Tensor]:
-    """The four pixels of each half pixel: (..., ceil(H / 2), ceil(W / 2)) each."""
+    """Return the four pixels of each half pixel: (..., ceil(H / 2), ceil(W / 2)) each."""
     even = _even(values)
     return [even[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
 
 
 def _even(values: Tensor) -> Tensor:
-    """(..., H, W) with the last row and column twice where their number is odd."""
+    """Repeat the last row and the last column of (..., H, W) where their number is odd."""
     if values.shape[-2] % 2:
         values = torch.cat([values, values[..., -1:, :]], -2)
-    return torch.cat([values, values[..., -1:]], -1) if values.shape[-1] % 2 else values
+    if values.shape[-1] % 2:
+        values = torch.cat([values, values[..., -1:]], -1)
+    return values

@@ -28,7 +28,7 @@ TINY = torch.finfo(torch.float32).tiny  # divisor where nothing counts, of a sum
 
 
 class CrossEntropy:
-    """Mean over labelled pixels of ``-q c_y log softmax(s)_y``, divided by the mean of ``c_y``.
+    """Averages ``-q c_y log softmax(s)_y`` over labelled pixels, divided by the mean of ``c_y``.
 
     q is the confidence of the label, 1 where labels carry none; it does not enter the mean that is
     divided by, so that labels of which the teacher is not sure cost little (HeatNet's release,
@@ -61,7 +61,7 @@ class CrossEntropy:
         batch: Batch,
         generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
     ) -> dict[str, Tensor]:
-        """The part "cross_entropy": one value, shape (1,), float32.
+        """Return the part "cross_entropy": one value, shape (1,), float32.
 
         Of `logits` (B, K, H, W), `label` (B, H, W) and `confidence` (B, H, W) or None.
         """
@@ -83,7 +83,7 @@ class CrossEntropy:
 
 
 def weights_from(pixels: NDArray[np.int64], kind: Computed) -> tuple[float, ...]:
-    """A weight of each class from its pixels in each label (N, K); 0 if it never occurs.
+    """Compute a weight of each class from its pixels in labels (N, K); 0 if it never occurs.
 
         enet              1 / ln(1.02 + p_c), p_c the share of all pixels
         median_frequency  median(f) / f_c, f_c the share of the pixels of labels that show c; the
@@ -108,7 +108,7 @@ def weights_from(pixels: NDArray[np.int64], kind: Computed) -> tuple[float, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class WithAuxiliary:
-    """A loss of the class scores plus ``weight`` times the same loss of the auxiliary ones.
+    """Adds to a loss of the class scores ``weight`` times the same loss of the auxiliary ones.
 
     Source: PSPNet (0.4); AdaptSegNet, Eq. 5, and MaxSquareLoss (0.1); thesis (J. Sun), code (0.1
     with maximum squares).
@@ -119,7 +119,7 @@ class WithAuxiliary:
 
     @property
     def record(self) -> LossRecord:
-        """That of `loss`, and a network with an auxiliary head."""
+        """Require what `loss` requires, and a network with an auxiliary head."""
         record = record_of(self.loss, LossRecord)
         auxiliary = Requirement("model", "auxiliary", True)
         return replace(record, requires=(*record.requires, auxiliary), reads_auxiliary=True)
@@ -127,12 +127,14 @@ class WithAuxiliary:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The weighted parts of `loss`, and those of `aux["aux_logits"]` as <part>_aux."""
-        parts = self.loss(output, batch, generator)
+        """Return the parts of `loss`, and weighted those of `aux["aux_logits"]` as <part>_aux."""
+        parts = dict(self.loss(output, batch, generator))
         auxiliary = self.loss(Output(output.aux["aux_logits"], {}), batch, generator)
-        return {**parts, **{f"{name}_aux": self.weight * part for name, part in auxiliary.items()}}
+        for name, part in auxiliary.items():
+            parts[f"{name}_aux"] = self.weight * part
+        return parts
 
 
 def single(values: Tensor) -> Tensor:
-    """The tensor in float32 at least, so that autocast does not sum millions of pixels in less."""
+    """Convert to float32 at least, so that autocast does not sum millions of pixels in less."""
     return values.to(torch.promote_types(values.dtype, torch.float32))

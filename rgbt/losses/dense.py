@@ -19,28 +19,25 @@ from rgbt.requirements import LossRecord, Requirement
 from rgbt.types import IGNORE, Batch, Output
 
 
-class PixelLoss(CrossEntropy):
-    """The base of losses that change what each pixel costs, or which pixels count."""
+def pixel_costs(
+    output: Output, label: Tensor, class_weights: tuple[float, ...] | None
+) -> tuple[Tensor, Tensor]:
+    """Return -log of the probability of the label of each pixel, and the weight of its class.
 
-    weighs_confidence = False
-
-    def costs(self, output: Output, label: Tensor) -> Tensor:
-        """-log of the probability of the label of each pixel, (B, H, W) float32; 0 where 255."""
-        assert output.logits is not None, "the record requires scores"
-        logits = output.logits.float()
-        return F.cross_entropy(logits, label, ignore_index=IGNORE, reduction="none")
-
-    def weights(self, label: Tensor) -> Tensor:
-        """The class weight of each pixel, (B, H, W); 0 where the label is 255."""
-        labelled = label != IGNORE
-        if self.class_weights is None:
-            return labelled.float()
-        known = torch.tensor(self.class_weights, device=label.device)
-        return known[label.where(labelled, 0)] * labelled
+    (B, H, W) float32 each; 0 where the label (B, H, W) is 255.
+    """
+    assert output.logits is not None, "the record requires scores"
+    logits = output.logits.float()
+    costs = F.cross_entropy(logits, label, ignore_index=IGNORE, reduction="none")
+    labelled = label != IGNORE
+    if class_weights is None:
+        return costs, labelled.float()
+    weights = torch.tensor(class_weights, device=label.device)
+    return costs, weights[label.where(labelled, 0)] * labelled
 
 
-class OhemCrossEntropy(PixelLoss):
-    """Cross-entropy of hard pixels (online hard example mining).
+class OhemCrossEntropy(CrossEntropy):
+    """Averages the cross-entropy of hard pixels (online hard example mining).
 
     Of each image those count whose probability of the label is below `threshold`, but at least
     `min_share` of its labelled pixels, the ones that cost most.
@@ -49,6 +46,8 @@ class OhemCrossEntropy(PixelLoss):
     a sixteenth). It chooses from the batch of a device; here from each image, so that the number of
     devices changes nothing.
     """
+
+    weighs_confidence = False
 
     def __init__(
         self,
@@ -67,8 +66,8 @@ class OhemCrossEntropy(PixelLoss):
         batch: Batch,
         generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
     ) -> dict[str, Tensor]:
-        """The part "ohem": one value, shape (1,), float32, of `logits` and `label`."""
-        costs, weights = self.costs(output, batch.label), self.weights(batch.label)
+        """Return the part "ohem": one value, shape (1,), float32, of `logits` and `label`."""
+        costs, weights = pixel_costs(output, batch.label, self.class_weights)
         chosen = torch.zeros_like(batch.label, dtype=torch.bool)
         easy = -math.log(self.threshold) if self.threshold else math.inf
         for n, label in enumerate(batch.label):
@@ -81,12 +80,14 @@ class OhemCrossEntropy(PixelLoss):
         return {"ohem": ((weights * costs * chosen).sum() / count).reshape(1)}
 
 
-class Focal(PixelLoss):
-    """Mean of ``-c_y (1 - p_y)^gamma log p_y`` over labelled pixels; c as in cross-entropy.
+class Focal(CrossEntropy):
+    """Averages ``-c_y (1 - p_y)^gamma log p_y`` over labelled pixels; c as in cross-entropy.
 
     Source: Lin et al. (ICCV 2017), Eq. 5, with softmax for sigmoid; gamma 2 there. As printed it is
     not divided by the weights.
     """
+
+    weighs_confidence = False
 
     def __init__(
         self,
@@ -104,16 +105,16 @@ class Focal(PixelLoss):
         batch: Batch,
         generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
     ) -> dict[str, Tensor]:
-        """The part "focal": one value, shape (1,), float32, of `logits` and `label`."""
-        costs = self.costs(output, batch.label)
+        """Return the part "focal": one value, shape (1,), float32, of `logits` and `label`."""
+        costs, weights = pixel_costs(output, batch.label, self.class_weights)
         rest = (-torch.expm1(-costs)).clamp(min=TINY)  # 1 - p
-        total = (self.weights(batch.label) * rest**self.gamma * costs).sum()
+        total = (weights * rest**self.gamma * costs).sum()
         count = mean_count((batch.label != IGNORE).sum().float()).clamp(min=1)
         return {"focal": (total / count).reshape(1)}
 
 
 class LovaszSoftmax:
-    """The Lovász extension of 1 - IoU, a mean over the classes of an image, then over images.
+    """Averages the Lovász extension of 1 - IoU over the classes of an image, then over images.
 
     Images without a labelled pixel cost 0 and count; `cross_entropy` is the weight of
     cross-entropy beside it (0: none).
@@ -129,7 +130,7 @@ class LovaszSoftmax:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The parts "lovasz" and "cross_entropy": each one value, shape (1,), float32."""
+        """Return the parts "lovasz" and "cross_entropy": one value each, shape (1,), float32."""
         assert output.logits is not None, "the record requires scores"
         shares = output.logits.float().softmax(1)
         costs = [
@@ -145,7 +146,7 @@ class LovaszSoftmax:
 
     @staticmethod
     def of_image(shares: Tensor, label: Tensor) -> Tensor:
-        """The loss of one image: of probabilities (K, P) and the labels (P,) of its pixels."""
+        """Compute the loss of one image of probabilities (K, P) and labels (P,) of its pixels."""
         costs = []
         for index in torch.unique(label).tolist():
             is_class = (label == index).float()

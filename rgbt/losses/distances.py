@@ -23,7 +23,9 @@ from rgbt.types import IGNORE
 
 
 def sdc(teacher: Tensor, student: Tensor) -> Tensor:
-    """Self-distillation of complementary representations: ``mean |stopgrad(teacher) - student|``.
+    """Compute self-distillation of complementary representations.
+
+        mean |stopgrad(teacher) - student|
 
     Source: CRM, Eq. (2).   Released: final layer only, raw logits, mean over all entries including
     the no-object column, teacher without gradient.
@@ -34,14 +36,14 @@ def sdc(teacher: Tensor, student: Tensor) -> Tensor:
 
 
 def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Self-distillation of non-local representations (CRM, Eq. 3), of R' and T' to F."""
+    """Compute self-distillation of non-local representations (CRM, Eq. 3), of R' and T' to F."""
     return sdc(teacher, rgb) + sdc(teacher, thermal)
 
 
 def thing_cells(
     label: Tensor, feature_hw: tuple[int, int], things: tuple[int, ...], min_share: float
 ) -> Tensor:
-    """(B, h, w) bool: cells of which one thing class has at least `min_share` of the pixels.
+    """Find cells, (B, h, w) bool, of which one thing class has at least `min_share` of the pixels.
 
     A cell of a label (B, H, W) has ceil(H / h) x ceil(W / w) pixels; what lies outside the label is
     of no class. With a share above 0.5, no second class has as many pixels.
@@ -49,18 +51,16 @@ def thing_cells(
     Released: lhoyer/DAFormer (e6f6e04), mmseg/utils/utils.py, downscale_label_ratio, whose cells
     divide the label.
     """
-    kernel = [-(-side // cells) for side, cells in zip(label.shape[1:], feature_hw, strict=True)]
-    rows, columns = (
-        size * cells - side
-        for size, cells, side in zip(kernel, feature_hw, label.shape[1:], strict=True)
-    )
-    padded = F.pad(label, (0, columns, 0, rows), value=IGNORE)
-    of_class = torch.stack([padded == each for each in things], 1).float()
+    (height, width), (rows, columns) = label.shape[1:], feature_hw
+    kernel = [-(-height // rows), -(-width // columns)]
+    below, right = kernel[0] * rows - height, kernel[1] * columns - width
+    padded = F.pad(label, (0, right, 0, below), value=IGNORE)
+    of_class = torch.stack([padded == index for index in things], 1).float()
     return (F.avg_pool2d(of_class, kernel) >= min_share).any(1)
 
 
 def feature_distance(features: Tensor, initial: Tensor, cells: Tensor) -> Tensor:
-    """Mean of ``||F_n - F'_n||_2`` over the `cells` n of two feature maps; 0 without a cell.
+    """Average ``||F_n - F'_n||_2`` over the `cells` n of two feature maps; 0 without a cell.
 
     Source: DAFormer (Hoyer et al., CVPR 2022), Sec. 3.3.   Released: lhoyer/DAFormer (e6f6e04),
     mmseg/models/uda/dacs.py, masked_feat_dist.
@@ -74,7 +74,7 @@ def feature_distance(features: Tensor, initial: Tensor, cells: Tensor) -> Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureDistance:
-    """Settings of the feature distance.
+    """Computes the weighted distance of features of things from those of the initial network.
 
     Released: configs/_base_/uda/dacs_a999_fdthings.py of lhoyer/DAFormer, with the ten classes of
     Cityscapes from traffic light, traffic sign and person to bicycle.
@@ -86,7 +86,7 @@ class FeatureDistance:
 
     @property
     def requires(self) -> tuple[Requirement, ...]:
-        """Features of the network, and weights that it starts from."""
+        """Require features of the network, and weights that it starts from."""
         setting = "scheme.feature_distance"
         advice = "name a file of weights with pretrained=FILE or model.weights=FILE"
         return (
@@ -97,13 +97,13 @@ class FeatureDistance:
     def __call__(
         self, features: Tensor, initial: Tensor, label: Tensor, classes: tuple[str, ...]
     ) -> Tensor:
-        """The weighted distance, () float32, of two maps (B, C, h, w) for a label (B, H, W)."""
+        """Return the weighted distance, () float32, of maps (B, C, h, w) for a label (B, H, W)."""
         hw = (features.shape[2], features.shape[3])
         cells = thing_cells(label, hw, self.indices(classes), self.min_share)
         return self.weight * feature_distance(features, initial, cells)
 
     def indices(self, classes: tuple[str, ...]) -> tuple[int, ...]:
-        """The indices of `things`; InputError where one is no class of the data set."""
+        """Return the indices of `things`; InputError where one is no class of the data set."""
         if unknown := [name for name in self.things if name not in classes]:
             raise InputError(
                 f"scheme.feature_distance.things: the data set has no class '{unknown[0]}'; "

@@ -22,7 +22,7 @@ EVERY = slice(None)
 
 
 class Points:
-    """Independent uniform points from one generator, on `device`.
+    """Draws independent uniform points from one generator, on `device`.
 
     Draws are made set by set in the order of the requests, so that the numbers do not depend on how
     many sets are requested at once. Each set is drawn for the batch of all processes. The criterion
@@ -40,7 +40,7 @@ class Points:
     def loss(
         self, num_sets: int, num_masks: int, num_points: int, kept: Tensor | slice = EVERY
     ) -> Tensor:
-        """(num_sets, `kept` of num_masks, num_points, 2): the next sets for the mask losses."""
+        """Draw the next sets for mask losses, (num_sets, `kept` of num_masks, num_points, 2)."""
         numbers = 2 * num_masks * num_points
         bits = torch.empty(
             num_sets, -(-numbers // 4), dtype=torch.int64, device=self.generator.device
@@ -54,13 +54,13 @@ class Points:
         return uniform.reshape(num_sets, uniform.shape[1], num_points, 2)
 
     def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
-        """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
+        """Draw the next sets for the matching costs, (num_sets, num_images, num_points, 2)."""
         of_all = num_processes()
         return self.loss(num_sets, num_images * of_all, num_points, slice(rank(), None, of_all))
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
-    """Bilinear values (R, C, S, N) of maps (R, C, h, w) at points (R, S, N, 2).
+    """Read bilinear values (R, C, S, N) of maps (R, C, h, w) at points (R, S, N, 2).
 
     `outside` lies beyond the outermost pixel centres (Mask2Former, point_features.py).
     """
@@ -68,7 +68,7 @@ def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "
 
 
 def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
-    """Bilinear values of the binary masks of all classes at points, without making the masks.
+    """Read bilinear values of the masks of all classes at points, without making the masks.
 
     The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
     point are read once. (B, H, W) int64, of which 255 is no class, at (S, B, N, 2) -> (S, B, K, N).
@@ -94,7 +94,7 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
 
 
 def most_uncertain(logits: Tensor, points: Tensor, keep: int) -> Tensor:
-    """The `keep` points of each mask whose logits are nearest to 0, in no particular order.
+    """Select the `keep` points of each mask whose logits are nearest to 0, in no particular order.
 
     (R, N) float32 logits, finite and overwritten, and (R, N, 2) -> (R, keep, 2).
     Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.

@@ -35,7 +35,7 @@ CHUNK_BYTES = 16 * 2**20
 
 @dataclass(kw_only=True, eq=False)
 class SetCriterion:
-    """Class, mask and dice loss of queries matched to classes.
+    """Computes the class, mask and dice loss of queries matched to classes.
 
         L = a CE + b BCE + d (1 - dice),  each summed over the prediction layers
 
@@ -72,7 +72,7 @@ class SetCriterion:
 
     @property
     def record(self) -> LossRecord:
-        """Masks of as many classes."""
+        """Require masks, and a data set of as many classes."""
         setting = f"loss.num_classes={self.num_classes}"
         return LossRecord(
             requires=(
@@ -84,7 +84,7 @@ class SetCriterion:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The parts "class", "mask" and "dice", (P,) float32, weighted and summed over the layers.
+        """Return the parts "class", "mask" and "dice", (P,) float32, weighted, summed over layers.
 
         `output.aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits" (L, P, B, Q, h, w) of
         P passes over the same B images; the last of the L layers is the prediction. The label is
@@ -103,14 +103,14 @@ class SetCriterion:
         return {name: weight * layers[name].sum(0) for name, weight in self.part_weights.items()}
 
     def layers(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
-        """The parts of every layer, not weighted, (L, P); L = 1 without deep supervision."""
+        """Return the parts of every layer, not weighted, (L, P); L = 1 without deep supervision."""
         class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
         (_, passes, images, _, channels), (*of_masks, h, w) = class_logits.shape, mask_logits.shape
         num_labels, height, width = batch.label.shape
         # Larger labels would be cut without an error.
         fits = channels == self.num_classes + 1 and of_masks == [*class_logits.shape[:4]]
         if not fits or num_labels != images or height > 4 * h or width > 4 * w:
-            shapes = [tuple(each.shape) for each in (class_logits, mask_logits, batch.label)]
+            shapes = [tuple(x.shape) for x in (class_logits, mask_logits, batch.label)]
             raise ValueError(f"class_logits, mask_logits and label do not fit: {shapes}.")
         padded_hw = (4 * h, 4 * w)
         if not self.deep_supervision:  # not `[0:]`: its backward would copy all gradients
@@ -133,7 +133,7 @@ class SetCriterion:
     def match(
         self, class_logits: Tensor, mask_logits: Tensor, targets: Targets, points: Points
     ) -> Matches:
-        """Hungarian matching on class, mask and dice costs at random points.
+        """Match by class, mask and dice costs at random points (Hungarian method).
 
             cost = -a softmax(class)[c] + b BCE + d (1 - (2 sum(s t) + e) / (sum(s) + sum(t) + e))
 
@@ -174,15 +174,17 @@ class SetCriterion:
         weights = torch.ones(self.num_classes + 1, device=logits_LPBQC.device)
         weights[-1] = self.no_object_weight
         logits = logits_LPBQC.float().reshape(layers * passes, images * queries, -1)
-        each = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
-        return each.sum(1) / mean_count(weights[label_SQ].sum(1))
+        costs = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
+        return costs.sum(1) / mean_count(weights[label_SQ].sum(1))
 
     def _mask_losses(
         self, logits_LPBQhw: Tensor, targets: Targets, matches: Matches, points: Points
     ) -> tuple[Tensor, Tensor]:
         """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,)."""
         device = logits_LPBQhw.device
-        image, label, query = (torch.from_numpy(each).to(device) for each in matches[:3])
+        image = torch.from_numpy(matches.image).to(device)
+        label = torch.from_numpy(matches.label).to(device)
+        query = torch.from_numpy(matches.query).to(device)
         masks = (targets.label[image] == label[:, None, None])[:, None].float()
         step = max(1, CHUNK_BYTES // max(1, 8 * len(image) * self.num_drawn))
 
@@ -212,7 +214,7 @@ class SetCriterion:
 
 
 class Targets(NamedTuple):
-    """The targets of one batch. Padded and ignored pixels are negatives of every mask."""
+    """Holds the targets of one batch. Padded and ignored pixels are negatives of every mask."""
 
     label: Tensor  # (B, H, W) int64, padded with 255
     present: Tensor  # (B, K) bool, classes that occur
@@ -221,7 +223,7 @@ class Targets(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """The assignment, on the CPU."""
+    """Holds the assignment, on the CPU."""
 
     image: NDArray[np.int64]  # (G,), image of each target
     label: NDArray[np.int64]  # (G,), class of each target
@@ -233,7 +235,7 @@ class Matches(NamedTuple):
 def targets_of(
     label: Tensor, padded_hw: tuple[int, int], num_classes: int, spatial: SpatialMap | None
 ) -> Targets:
-    """Targets of labels (B, H, W) int64, padded at the bottom and right to `padded_hw`."""
+    """Make targets of labels (B, H, W) int64, padded at the bottom and right to `padded_hw`."""
     # One column per label value -1 (anything below 0) to 256 (anything above 255).
     seen = torch.zeros(len(label), IGNORE + 3, dtype=torch.bool, device=label.device)
     seen.scatter_(1, label.flatten(1).clamp(-1, IGNORE + 1) + 1, True)
@@ -267,7 +269,7 @@ def pairwise_costs(
 
 
 def assign(cost: Tensor, targets: Targets) -> Matches:
-    """Cheapest assignment of queries to the classes present, for (S, B, Q, K) float32 costs."""
+    """Assign queries to the classes present as cheaply as possible; costs are (S, B, Q, K)."""
     parts = [cost.flatten(), whole(targets.present).flatten(), targets.unknown.reshape(1)]
     numbers = torch.cat([part.float() for part in parts]).cpu().numpy()
     cost_SBQK = numbers[: cost.numel()].reshape(cost.shape)
@@ -301,7 +303,7 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
 
 
 def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[Tensor, Tensor]:
-    """Binary cross-entropy and dice loss of masks at points.
+    """Compute binary cross-entropy and dice loss of masks at points.
 
         BCE  = sum w (softplus(x) - x t) / total
         dice = 1 - (2 sum w s t + e) / (sum w s + sum w t + e),  s = sigmoid(x)
@@ -324,6 +326,6 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
 
 
 def _read(logits_SGhw: Tensor, points_SGN2: Tensor) -> Tensor:
-    """(S, G, N) every mask at its own points."""
+    """Read every mask at its own points: (S, G, N)."""
     values = sample(logits_SGhw.flatten(0, 1)[:, None], points_SGN2.flatten(0, 1)[:, None])
     return values.reshape(points_SGN2.shape[:-1])

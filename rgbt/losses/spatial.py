@@ -24,7 +24,7 @@ from rgbt.types import IGNORE, Batch
 
 @dataclass(frozen=True, kw_only=True)
 class SpatialWeight:
-    """Settings of the spatial-weighted mask losses; by default it is the plain loss.
+    """Holds the settings of the spatial-weighted mask losses; the default is the plain loss.
 
         w = 1 + alpha d / d_max            focus "edge"    (Eqs. 14, 15)
         w = 1 + alpha (1 - d / d_max)      focus "center"  (Table VI, reversed)
@@ -52,7 +52,7 @@ class SpatialWeight:
 
     @property
     def active(self) -> bool:
-        """Whether the loss differs from the plain one at all."""
+        """Say whether the loss differs from the plain one at all."""
         return self.alpha > 0 and self.focus != "none"
 
 
@@ -60,7 +60,7 @@ PLAIN = SpatialWeight()
 
 
 class PointWeights(NamedTuple):
-    """Weights of the points of some masks, and what the weighted mask losses need beside them."""
+    """Holds weights of the points of some masks, and what the losses need beside them."""
 
     values: Tensor  # (..., N)
     total: Tensor  # (...), what the weighted cross-entropy is divided by
@@ -68,9 +68,10 @@ class PointWeights(NamedTuple):
 
 
 def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight) -> Tensor:
-    """(B, 1, *padded_hw) float32: weight of every pixel of a crop padded at the bottom and right.
+    """Compute the weight of every pixel of a crop padded at the bottom and right.
 
-    SpatialSeg, Eqs. 14 and 15; see `SpatialWeight`. The settings are active.
+    (B, 1, *padded_hw) float32; the settings are active. SpatialSeg, Eqs. 14 and 15; see
+    `SpatialWeight`.
 
     Raises:
         InputError: the batch does not say where its pixels come from.
@@ -101,7 +102,7 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
 
 
 def boundaries(label: Tensor) -> Tensor:
-    """(B, H, W) bool: labelled pixels of (B, H, W) int64 with another class beside them.
+    """Find labelled pixels of (B, H, W) int64 with another class beside them: (B, H, W) bool.
 
     Eight neighbours count. Both sides of a boundary do, so it is two pixels wide. The border of the
     image and pixels without a label (255) make no boundary.
@@ -117,7 +118,7 @@ def boundaries(label: Tensor) -> Tensor:
 
 
 class SpatialMap:
-    """The weights of one batch, read at points; see `weight_map`.
+    """Reads the weights of one batch at points; see `weight_map`.
 
     `num_passes` is P, stacked passes of the batch, for `passes: fused`: the clean RGB-T pass is the
     first; a masked RGB-T pass, if any, is the last, after one or three clean ones.
@@ -135,7 +136,7 @@ class SpatialMap:
         self.weighted_P = weighted_P.to(self.map_B1HW.device)
 
     def at(self, points: Tensor, image: Tensor, first_set: int) -> PointWeights:
-        """Weights at points (S, G, N, 2), see `rgbt.losses.points`.
+        """Read weights at points (S, G, N, 2), see `rgbt.losses.points`.
 
         `image` (G,) int64 says which image of the batch each of the G columns belongs to;
         `first_set` is the number of the first of the S sets; pass = set modulo P.

@@ -30,7 +30,7 @@ OWN = ("dice", "con", "con_acc")
 
 @dataclass(frozen=True, kw_only=True)
 class TemporalLoss:
-    """Segmentation of both frames, Dice of the first, and Dice or consistency of the second.
+    """Adds the segmentation losses of two frames, Dice of the first, and a loss of the second.
 
         L = seg_1 + alpha dice_1 + seg_2 + beta X
 
@@ -53,7 +53,7 @@ class TemporalLoss:
 
     @property
     def record(self) -> LossRecord:
-        """The requirements of the loss of each frame, and a scheme of two frames."""
+        """Require what the loss of a frame requires, and a scheme of two frames."""
         own = [Requirement("scheme", "frames", 2)]
         # As released, Dice and con_acc leave out class 0.
         if self.form == "released" and (self.alpha or self.second in ("dice", "con_acc")):
@@ -74,7 +74,7 @@ class TemporalLoss:
         valid: Tensor,
         generator: torch.Generator,
     ) -> dict[str, Tensor]:
-        """The weighted parts, which add up to L.
+        """Return the weighted parts, which add up to L.
 
         Args:
             first: frame 1.
@@ -118,7 +118,7 @@ class TemporalLoss:
 
 
 def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
-    """Dice loss over all pixels of the batch that count, averaged over the K classes.
+    """Compute Dice loss over all pixels of the batch that count, averaged over the K classes.
 
         paper      1 - mean_c  2 sum p_c y_c / sum (p_c^2 + y_c^2)
         released   mean_c of  1 - 2 sum p_c y_c / sum (p_c + y_c),  0 for a class without a pixel
@@ -139,7 +139,7 @@ def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
 
 
 def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
-    """Consistency loss: soft overlap of two predictions, no label.
+    """Compute consistency loss: the soft overlap of two predictions, no label.
 
         1 - 1/K sum_c  2 sum p_c q_c / sum (p_c + q_c + sigma)
 
@@ -154,7 +154,7 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
     """
     pairs = single(warped), single(second), valid
     sums: tuple[Tensor, Tensor] = _PairSums.apply(*pairs)  # type: ignore[no-untyped-call]
-    overlap, size = (total(each) for each in sums)
+    overlap, size = total(sums[0]), total(sums[1])
     if form == "paper":
         size = size + SIGMA * total(valid.sum())
     # With sigma inside, no sum over at least one pixel lies below this.
@@ -162,7 +162,7 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
 
 
 def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor:
-    """Consistency and accuracy loss: soft overlap of two predictions and the label, y one-hot.
+    """Compute consistency and accuracy loss: the soft overlap of two predictions and the label y.
 
         1 - 1/K sum_c  f sum p_c q_c y_c / sum (p_c + q_c + y_c + sigma)
 
@@ -184,7 +184,7 @@ def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor
 
 
 class _Target:
-    """Which pixels count, and as what: all labelled ones; as released, none of the background."""
+    """Says which pixels count: all labelled ones, or, as released, those of no background."""
 
     def __init__(self, label: Tensor, probabilities: Tensor, form: Form) -> None:
         counted = label != IGNORE
@@ -196,25 +196,25 @@ class _Target:
         self.pixels = self.by_class(self.weight)
 
     def labelled(self, probabilities: Tensor) -> Tensor:
-        """(B, H, W): the probability of the labelled class, 0 where a pixel does not count."""
+        """Return the probability of the labelled class, (B, H, W), 0 where no pixel counts."""
         return probabilities.gather(1, self.label[:, None])[:, 0] * self.weight
 
     def by_class(self, values: Tensor) -> Tensor:
-        """(K,): sums of (B, H, W) values over the pixels of each class, of all processes."""
+        """Sum (B, H, W) values over the pixels of each class, of all processes: (K,)."""
         rows = values.new_zeros(*values.shape[:2], self.num_classes)
         return total(rows.scatter_add(2, self.label, values).sum((0, 1)))
 
     def counted(self, values: Tensor) -> Tensor:
-        """(K,): sums of (B, K, H, W) values over the pixels that count, of all processes."""
+        """Sum (B, K, H, W) values over the pixels that count, of all processes: (K,)."""
         return total((values * self.weight[:, None]).sum((0, 2, 3)))
 
     def averaged(self, cost: Tensor) -> Tensor:
-        """Mean of K costs; as released, classes without a pixel cost 0."""
+        """Average K costs; as released, classes without a pixel cost 0."""
         return cost.mean() if self.form == "paper" else cost.where(self.pixels > 0, 0.0).mean()
 
 
 class _PairSums(torch.autograd.Function):
-    """(K,) sums of p q and (K,) sums of p + q over the pixels that count.
+    """Sums p q and p + q over the pixels that count: (K,) each.
 
     The gradients are what automatic differentiation gives, without keeping masked copies: one pass
     for each of them.

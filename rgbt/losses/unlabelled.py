@@ -26,7 +26,7 @@ LEAST = 1e-30  # the smallest probability that a logarithm is taken of (ADVENT r
 
 @dataclass(frozen=True, kw_only=True)
 class MaxSquares:
-    """Negative sum of squared probabilities.
+    """Computes the negative sum of squared probabilities.
 
         pixels     -1 / (2 N)   sum_n sum_k p_nk^2
         entries    -1 / (2 N K) sum_n sum_k p_nk^2
@@ -48,7 +48,7 @@ class MaxSquares:
     image_wise_ratio: Share | None
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "max_squares", () <= 0, of (B, K, H, W) in [0, 1] that sum to 1 over K."""
+        """Return the part "max_squares", () <= 0, of (B, K, H, W) whose sums over K are 1."""
         probabilities = single(probabilities)
         squares = probabilities.square().sum(1)
         entries = self.normalisation == "entries"
@@ -68,7 +68,7 @@ class MaxSquares:
 
 @dataclass(frozen=True, kw_only=True)
 class Entropy:
-    """Mean over pixels of ``-sum_k p_k log p_k / log K``, in [0, 1].
+    """Averages ``-sum_k p_k log p_k / log K`` over pixels, in [0, 1].
 
     Source: ADVENT, Eqs. 2 and 3; thesis (J. Sun), Eq. 1, which does not print the mean.
     Released: ADVENT, with weight 0.001.
@@ -77,19 +77,19 @@ class Entropy:
     weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "entropy", (), of (B, K, H, W) in [0, 1] that sum to 1 over K."""
+        """Return the part "entropy", (), of (B, K, H, W) in [0, 1] that sum to 1 over K."""
         probabilities = single(probabilities)
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
         return {"entropy": self.weight * surprise.sum(1).mean() / _most(probabilities)}
 
 
 def _most(scores: Tensor) -> float:
-    """Logarithm of K, the highest entropy of K classes; of one class, the entropy is 0."""
+    """Return the highest entropy of K classes, log K; of one class, whose entropy is 0, log 2."""
     return math.log(max(scores.shape[1], 2))
 
 
 def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float) -> Tensor:
-    """Self-produced guidance: the class of the mean of two predictions.
+    """Return self-produced guidance: the class of the mean of two predictions.
 
         label = argmax_k (p_k + q_k) / 2   where max_k p_k > t or max_k q_k > t, else 255
 
@@ -107,7 +107,7 @@ WeightedBy = Literal["batch", "image"]
 
 
 class PseudoLabels(NamedTuple):
-    """Labels of a batch, and what is logged of them; float32 in [0, 1]."""
+    """Holds labels of a batch, and what is logged of them; float32 in [0, 1]."""
 
     label: Tensor  # (B, H, W) int64, every pixel has a class
     weight: Tensor  # (B, H, W)
@@ -118,7 +118,7 @@ class PseudoLabels(NamedTuple):
 def pseudo_labels(
     scores: Tensor, threshold: float, weighted_by: WeightedBy, ignored: tuple[float, float]
 ) -> PseudoLabels:
-    """The class of every pixel, weighted by the share of confident pixels.
+    """Label every pixel with its class, weighted by the share of confident pixels.
 
         y = argmax_k p_k,   q = mean over pixels of [max_k p_k >= threshold]
 
@@ -147,7 +147,7 @@ Judged = Literal["probabilities", "logits", "self_information"]
 
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:
-    """Mean of ``(value - D)^2`` over verdicts D of any shape; ().
+    """Average ``(value - D)^2`` over verdicts D of any shape; ().
 
     Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
     """
@@ -155,7 +155,7 @@ def least_squares(verdicts: Tensor, value: float) -> Tensor:
 
 
 def logistic(verdicts: Tensor, value: float) -> Tensor:
-    """Mean of ``-value log s(D) - (1 - value) log (1 - s(D))`` with the logistic function s.
+    """Average ``-value log s(D) - (1 - value) log (1 - s(D))`` with the logistic function s.
 
     Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
     """
@@ -167,7 +167,7 @@ VERDICT_LOSSES = {"least_squares": least_squares, "cross_entropy": logistic}
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:
-    """The input map of a discriminator.
+    """Return the input map of a discriminator.
 
         probabilities       p = softmax of the class scores    AdaptSegNet, thesis (J. Sun)
         logits              the class scores                   HeatNet

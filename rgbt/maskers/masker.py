@@ -72,7 +72,7 @@ class Masker:
 
     @property
     def record(self) -> MaskerRecord:
-        """Cells are hidden, but by the sampler "none"; a scheme then omits the masked pass."""
+        """State whether cells are hidden; a scheme omits the masked pass where none are."""
         return MaskerRecord(hides_cells=self.sampler != "none")
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class Masker:
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> MaskPair:
-        """(B, h, w) bool cells of the padded crop, True = hidden, one independent draw per sample.
+        """Draw cells (B, h, w) bool of the padded crop, True = hidden, independent per sample.
 
         `image_hw` is the size of the crop in pixels, before padding, and `centre_yx` (B, 2) the
         pixel of the crop nearest to the centre of the original image, on the generator's device.
@@ -117,7 +117,7 @@ class Masker:
         return MaskPair(rgb=taken & (pattern != 0), thermal=~taken & (pattern != 1))
 
     def grid_hw(self, image_hw: tuple[int, int]) -> tuple[int, int]:
-        """(h, w) cells of a crop of `image_hw` pixels; InputError if they are no whole cells."""
+        """Count the cells (h, w) of a crop of `image_hw` pixels; InputError for parts of cells."""
         height, width = padded_hw(image_hw)
         size = self.patch_size or STRIDE
         if height % size or width % size:
@@ -130,7 +130,7 @@ class Masker:
     def _draw(
         self, grid_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """(B, h, w) bool, the cells that one mask takes."""
+        """Draw the cells that one mask takes, (B, h, w) bool."""
         if self.ratio is None:
             return bernoulli(self._log_weight(grid_hw, centre_yx), generator)
         if self.sampler == "square":
@@ -142,7 +142,7 @@ class Masker:
         return fixed_count(weight, num_taken(grid_hw, self.ratio), generator)
 
     def _log_weight(self, grid_hw: tuple[int, int], centre_yx: Tensor) -> Tensor:
-        """Logarithm (B, h, w) of a Gaussian of the distance in cells from a centre, 0 there.
+        """Return log (B, h, w) of a Gaussian of the distance in cells from a centre, 0 there.
 
             log W(y, x) = -((y + o - c_y)^2 + (x + o - c_x)^2) / (2 sigma^2)
 
@@ -168,12 +168,12 @@ class Masker:
 
 
 def num_taken(grid_hw: tuple[int, int], ratio: float) -> int:
-    """``ceil(h w ratio)`` cells (CRM release); 20 * 0.55 = 11.000000000000002 are eleven."""
+    """Return ``ceil(h w ratio)`` (CRM release); 20 * 0.55 = 11.000000000000002 are eleven."""
     return math.ceil(grid_hw[0] * grid_hw[1] * ratio - 1e-9)
 
 
 def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Exactly `count` cells per mask, drawn one after the other without replacement.
+    """Draw exactly `count` cells per mask, one after the other, without replacement.
 
     Each draw takes a cell with probability proportional to its weight among the cells still there.
     The same distribution in one step (Efraimidis and Spirakis, Information Processing Letters 97,
@@ -187,7 +187,7 @@ def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> T
 
 
 def bernoulli(log_probability: Tensor, generator: torch.Generator) -> Tensor:
-    """Every cell of (B, h, w) independently with its own probability (SpatialSeg, Eq. 9)."""
+    """Draw cells (B, h, w) independently with their own probabilities (SpatialSeg, Eq. 9)."""
     uniform = torch.rand(log_probability.shape, generator=generator, device=log_probability.device)
     return uniform < log_probability.exp()
 
@@ -195,7 +195,7 @@ def bernoulli(log_probability: Tensor, generator: torch.Generator) -> Tensor:
 def square(
     batch: int, grid_hw: tuple[int, int], ratio: float, generator: torch.Generator
 ) -> Tensor:
-    """One rectangle per mask at a uniformly drawn position, `ratio` of the height and of the width.
+    """Draw a rectangle per mask at a uniform position, `ratio` of the height and of the width.
 
     Sides are rounded to whole cells; (B, h, w) bool. Paper: CRM, Fig. 5 (half of both sides).
     Released: the square mask stops with a size mismatch (rows and columns of the slice are

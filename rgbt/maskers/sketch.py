@@ -28,7 +28,7 @@ SAMPLES, DRAWS, GREY = 5, 2000, 127
 
 
 def greyed(image: NDArray[np.generic], hidden: torch.Tensor) -> NDArray[np.uint8]:
-    """Copy of (H, W, ...), padded at the bottom and right, grey where `hidden` (h, w) is true."""
+    """Copy (H, W, ...), padded at the bottom and right, grey where `hidden` (h, w) is true."""
     height, width = padded_hw((image.shape[0], image.shape[1]))
     padded = np.zeros((height, width, *image.shape[2:]), np.uint8)
     padded[: image.shape[0], : image.shape[1]] = image
@@ -38,7 +38,7 @@ def greyed(image: NDArray[np.generic], hidden: torch.Tensor) -> NDArray[np.uint8
 
 
 def draw(masker: AnyMasker, examples: Sequence[Example], seed: int, title: str) -> Figure:
-    """The picture; every mask is derived from `seed`."""
+    """Draw the picture; every mask is derived from `seed`."""
     columns = len(examples) + 1
     figure = Figure(figsize=(2.6 * columns, 4.6), layout="constrained")
     axes = figure.subplots(2, columns, squeeze=False)

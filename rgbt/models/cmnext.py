@@ -7,7 +7,6 @@ which exists from three modalities on. Maps are (N, H, W, C) between the blocks,
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
@@ -25,7 +24,7 @@ from rgbt.models.cmx.model import (
     Stream,
     drop_rates,
 )
-from rgbt.models.cmx.parts import NORM_EPS, initialise, mit_blocks
+from rgbt.models.cmx.parts import NORM_EPS, initialise, mit_blocks, mix_ffn
 from rgbt.models.inputs import Inputs
 from rgbt.models.parts import ALL_KEPT, Keep, add_residual
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
@@ -34,7 +33,7 @@ MAP_NORM_EPS = 1e-6  # thermal patch embeddings and after its stages; RGB stream
 
 
 class PoolingGate(nn.Module):
-    """Gate of a map from its means over windows of several sizes (CMNeXt release).
+    """Gates a map by its means over windows of several sizes (CMNeXt release).
 
     sigmoid(conv1x1(c + sum_k mean_k(c))) x + x,   c = depthwise 7x7 of x
     """
@@ -55,30 +54,15 @@ class PoolingGate(nn.Module):
 
 
 def window_mean(x: Tensor, window: int) -> Tensor:
-    """Mean of (N, C, H, W) over the odd window around every position, inside the map alone."""
+    """Average (N, C, H, W) over the odd window around every position, inside the map alone."""
     # The mean over columns of means over rows: every row has as many positions.
     for kernel, padding in (((window, 1), (window // 2, 0)), ((1, window), (0, window // 2))):
         x = F.avg_pool2d(x, kernel, 1, padding, count_include_pad=False)
     return x
 
 
-class ConvFfn(nn.Module):
-    """1x1 convolution, depthwise 3x3 convolution, exact GELU, 1x1 convolution."""
-
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Conv2d(dim, hidden, 1)
-        depthwise = nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)
-        self.dwconv = nn.Sequential(OrderedDict(dwconv=depthwise))  # the released name
-        self.fc2 = nn.Conv2d(hidden, dim, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) -> the same."""
-        return self.fc2(F.gelu(self.dwconv(self.fc1(x))))
-
-
 class PpxBlock(nn.Module):
-    """Gated pooling and a feed-forward network; the channels of what passes by are weighted.
+    """Adds gated pooling and a feed-forward network to a map whose channels are weighted.
 
     y = x + l1 gate(norm(x))        w = sigmoid(conv over channels of the means of y)
     w y + l2 ffn(norm(y))           l1, l2: a learned factor per channel
@@ -91,7 +75,11 @@ class PpxBlock(nn.Module):
         self.norm1 = nn.BatchNorm2d(dim)
         self.attn = PoolingGate(dim, windows)
         self.norm2 = nn.BatchNorm2d(dim)
-        self.mlp = ConvFfn(dim, hidden)
+        self.mlp = mix_ffn(
+            nn.Conv2d(dim, hidden, 1),
+            nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden),
+            nn.Conv2d(hidden, dim, 1),
+        )
         self.layer_scale_1 = nn.Parameter(torch.full((dim,), layer_scale))
         self.layer_scale_2 = nn.Parameter(torch.full((dim,), layer_scale))
         self.c_nets = nn.Sequential(nn.Conv1d(1, 1, 3, padding=1, bias=False), nn.Sigmoid())
@@ -110,7 +98,7 @@ Window = Annotated[int, Interval(ge=1, le=99), Predicate(lambda n: n % 2), doc("
 
 
 class CMNeXt(CmxNetwork):
-    """CMNeXt for RGB and one further modality, thermal.
+    """Predicts from both images by CMNeXt, whose further modality is thermal.
 
     Source: J. Zhang et al., Delivering Arbitrary-Modal Semantic Segmentation, CVPR 2023.
     Released: jamycheung/DELIVER. With two modalities its self-query hub does not exist.

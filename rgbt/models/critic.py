@@ -13,7 +13,7 @@ from rgbt.requirements import NetworkRecord, Requirement
 
 
 class Critic(nn.Module):
-    """Five strided 4x4 convolutions, no normalisation, no sigmoid.
+    """Judges the domain of a map by five strided 4x4 convolutions, without normalisation.
 
     Source: AdaptSegNet, Sec. 3.2 ("discriminator"); HeatNet and the thesis use the same.
     Weights keep torch's initialisation, as released.
@@ -30,7 +30,7 @@ class Critic(nn.Module):
         if align_corners and not upsample:
             raise InputError("critic.align_corners has no effect with critic.upsample=false.")
         self.upsample, self.align_corners = upsample, align_corners
-        widths = (in_channels, *(base_width * factor for factor in (1, 2, 4, 8)), 1)
+        widths = (in_channels, base_width, 2 * base_width, 4 * base_width, 8 * base_width, 1)
         self.conv1, self.conv2, self.conv3, self.conv4, self.classifier = (
             nn.Conv2d(before, after, 4, stride=2, padding=1) for before, after in pairwise(widths)
         )
@@ -39,7 +39,7 @@ class Critic(nn.Module):
         self.record = NetworkRecord(requires=(need,))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Verdicts, not squashed; which number stands for which domain is the loss's choice.
+        """Return verdicts, not squashed; the loss chooses which number stands for which domain.
 
         (N, in_channels, H, W), sides of at least 32 -> (N, 1, h, w) with h = H // 32, w = W // 32,
         or 32 times that with `upsample`: H and W, or a little less where 32 does not divide them.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial, reduce
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -13,7 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice
 from rgbt.models.inputs import Images, Inputs, Network, as_rgb
-from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
+from rgbt.models.parts import DropRates, StrideAt, bottleneck_stage, enlarge, up_block
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
 from rgbt.requirements import NetworkRecord, Requirement
 from rgbt.types import Output, View
@@ -24,10 +23,10 @@ Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64
 
 
 class Backbone(nn.Module):
-    """ResNet with the stride on the first 1x1 convolution and both last stages dilated throughout.
+    """Computes features of an image by a ResNet whose last two stages are dilated throughout.
 
-    Parameters have torchvision's names, so that its ImageNet files fit, although there the stride
-    sits on the 3x3 convolution.
+    The stride of a block is on its first 1x1 convolution. Parameters have torchvision's names, so
+    that its ImageNet files fit, although there the stride is on the 3x3 convolution.
 
     Source: DeepLab v2, Sec. 3.1.   Released: AdaptSegNet, ADVENT, MaxSquareLoss, thesis.
     """
@@ -36,14 +35,18 @@ class Backbone(nn.Module):
         self, depths: tuple[int, int, int, int], width: int, *, ceil_mode: bool, train_norm: str
     ) -> None:
         super().__init__()
-        stage = partial(bottleneck_stage, stride_at="1x1")
         self.pool = nn.MaxPool2d(3, stride=2, padding=1, ceil_mode=ceil_mode)
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
-        self.layer1 = stage(width, width, depths[0])
-        self.layer2 = stage(4 * width, 2 * width, depths[1], stride=2)
-        self.layer3 = stage(8 * width, 4 * width, depths[2], dilations=(2, 2))
-        self.layer4 = stage(16 * width, 8 * width, depths[3], dilations=(4, 4))
+        at: StrideAt = "1x1"
+        self.layer1 = bottleneck_stage(width, width, depths[0], stride_at=at)
+        self.layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2, stride_at=at)
+        self.layer3 = bottleneck_stage(
+            8 * width, 4 * width, depths[2], dilations=(2, 2), stride_at=at
+        )
+        self.layer4 = bottleneck_stage(
+            16 * width, 8 * width, depths[3], dilations=(4, 4), stride_at=at
+        )
         for module in self.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.requires_grad_(train_norm == "all")
@@ -56,7 +59,7 @@ class Backbone(nn.Module):
 
 
 class AtrousPyramid(nn.Module):
-    """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
+    """Adds parallel dilated 3x3 convolutions (ASPP).
 
     Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
     MaxSquareLoss and the thesis leave their loop early, so that only the first two (`summed_rates`)
@@ -74,40 +77,24 @@ class AtrousPyramid(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, h, w) -> (N, out, h, w)."""
-        return reduce(torch.add, (self.conv2d_list[index](x) for index in self.summed))
-
-
-class DeepLabHead(nn.Module):
-    """A pyramid, and in the modified decoders three up blocks.
-
-    Source: thesis, Sec. III-B and Fig. 5: a modified decoder keeps the number of channels.
-    Released: the training scripts import the network without up blocks. A file that no script
-    imports has a modified decoder of HeatNet's widths, which ends with a 1x1 convolution (`final`).
-    """
-
-    def __init__(
-        self, aspp: AtrousPyramid, ups: list[UpBlock], final: nn.Module, dropout: DropRates
-    ) -> None:
-        super().__init__()
-        self.dropout = dropout
-        self.aspp = aspp
-        self.ups = nn.ModuleList(ups)
-        self.final = final
-
-    def forward(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
-        """(N, in, h, w) -> (N, K, h, w), or (N, K, 8 h, 8 w) from a modified decoder."""
-        rates = self.dropout if self.training else (0.0, 0.0)
-        return self.final(enlarge(self.aspp(x), self.ups, rates, generator))
+        first, *others = self.summed
+        total = self.conv2d_list[first](x)
+        for index in others:
+            total = total + self.conv2d_list[index](x)
+        return total
 
 
 class DeepLabV2(Network):
-    """DeepLab v2 with a backbone that all domains share and one head, or one per domain.
+    """Predicts from RGB or thermal by a backbone that all domains share and a head, or several.
 
-    Sees the RGB image or the thermal image, never both. Weights of convolutions are drawn from
-    N(0, 0.01), as released; biases and slopes keep torch's initialisation.
+    A head is a pyramid, and in the modified decoders three up blocks. Weights of convolutions are
+    drawn from N(0, 0.01), as released; biases and slopes keep torch's initialisation.
 
     Source: DeepLab v2; thesis (J. Sun, Multi-head), Sec. III.   Released: AdaptSegNet, ADVENT and
     MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
+    Paper: a modified decoder keeps the number of channels (thesis, Sec. III-B and Fig. 5).
+    Released: the training scripts import the network without up blocks. A file that no script
+    imports has a modified decoder of HeatNet's widths, which ends with a 1x1 convolution (`final`).
 
     The arguments are the keys of ``conf/model/deeplabv2.yaml``.
     """
@@ -151,18 +138,26 @@ class DeepLabV2(Network):
         channels = 32 * base_width
         sizes = {
             "basic": (num_classes,),
-            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_heatnet": (channels // 2, channels // 8, channels // 32, channels // 32),
             "modified_thesis": (num_classes,) * 4,
         }[decoder]
-        pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
+        self.dropout = dropout
         self.heads = nn.ModuleDict()
         for name in heads:
-            aspp = pyramid(channels, sizes[0])
-            ups = [UpBlock(*pair, align_corners=align_corners) for pair in pairwise(sizes)]
+            head = nn.ModuleDict()
+            head["aspp"] = AtrousPyramid(channels, sizes[0], rates=rates, summed_rates=summed_rates)
+            head["ups"] = nn.ModuleList(
+                up_block(before, after, align_corners=align_corners)
+                for before, after in pairwise(sizes)
+            )
             is_wide = decoder == "modified_heatnet"
-            final = nn.Conv2d(sizes[-1], num_classes, 1) if is_wide else nn.Identity()
-            self.heads[name] = DeepLabHead(aspp, ups, final, dropout)
-        self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
+            head["final"] = nn.Conv2d(sizes[-1], num_classes, 1) if is_wide else nn.Identity()
+            self.heads[name] = head
+        self.auxiliary = None
+        if auxiliary:
+            self.auxiliary = AtrousPyramid(
+                16 * base_width, num_classes, rates=rates, summed_rates=summed_rates
+            )
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0.0, 0.01)
@@ -171,7 +166,7 @@ class DeepLabV2(Network):
     def predict(
         self, images: Images, view: View, generator: torch.Generator | None, head: str | None = None
     ) -> Output:
-        """Class scores from one image by one head.
+        """Predict class scores from one image by one head.
 
         Of several heads, `head` names the one (InputError: there is none); None: the first.
         In aux: "features" (N, 32 w, h, w) of the fourth stage; "aux_logits" (N, K, H, W) of the
@@ -180,11 +175,18 @@ class DeepLabV2(Network):
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
         layer3, layer4 = self.backbone(images.rgb if view == "rgb" else as_rgb(images.thermal))
-        found = {"logits": self.heads[name](layer4, generator)}
+        aspp, ups, final = self.heads[name].children()
+        drop_rates = self.dropout if self.training else (0.0, 0.0)
+        scores = final(enlarge(aspp(layer4), ups.children(), drop_rates, generator))
+        logits = self._at_size(scores, images.rgb)
+        aux = {"features": layer4}
         if self.auxiliary is not None:
-            found["aux_logits"] = self.auxiliary(layer3)
-        size, corners = images.rgb.shape[2:], self.align_corners
-        for key, each in found.items():
-            if each.shape[2:] != size:
-                found[key] = F.interpolate(each, size, mode="bilinear", align_corners=corners)
-        return Output(found.pop("logits"), {"features": layer4, **found})
+            aux["aux_logits"] = self._at_size(self.auxiliary(layer3), images.rgb)
+        return Output(logits, aux)
+
+    def _at_size(self, scores: Tensor, image: Tensor) -> Tensor:
+        """Enlarge scores (N, K, h, w) to the size of an image (N, C, H, W)."""
+        size = image.shape[2:]
+        if scores.shape[2:] == size:
+            return scores
+        return F.interpolate(scores, size, mode="bilinear", align_corners=self.align_corners)

@@ -21,7 +21,7 @@ from rgbt.types import MaskPair, Output, View
 
 
 class Images(NamedTuple):
-    """Normalised images: rgb (N, 3, H', W') and thermal (N, c, H', W'), padded with 0."""
+    """Holds normalised images: rgb (N, 3, H', W') and thermal (N, c, H', W'), padded with 0."""
 
     rgb: Tensor
     thermal: Tensor
@@ -31,7 +31,7 @@ Deviation = Annotated[float, Interval(ge=0.001, le=10_000)]
 
 
 class Inputs(nn.Module):
-    """Images in [0, 1] to what a network was trained on: ``(255 x - mean) / std`` per channel.
+    """Converts images in [0, 1] to what a network was trained on: ``(255 x - mean) / std``.
 
     The arguments are the keys of ``conf/model/inputs/crm.yaml``. "gray" is the luma in all three
     channels. A single thermal channel is repeated for three values. With "image_max", an image of
@@ -70,7 +70,7 @@ class Inputs(nn.Module):
     def forward(
         self, rgb: Tensor, thermal: Tensor, masks: MaskPair | None = None, *, multiple: int = 1
     ) -> Images:
-        """Normalised images; hidden pixels and padding are 0: the mean, or black where that is 0.
+        """Normalise images; hidden pixels and padding are 0: the mean, or black where that is 0.
 
         Arguments and errors as `rgbt.models` says; sides are padded at the bottom and right to
         multiples of `multiple`.
@@ -101,7 +101,7 @@ class Inputs(nn.Module):
 
 
 class Network(nn.Module):
-    """What networks of dense class scores share: one view, normalised images, no padded scores.
+    """Predicts dense class scores of one view of normalised images, without those of padding.
 
     `multiple` divides the sides of the padded images. Each network has a method
     `predict(images, view, generator)`, whose docstring says what it adds to `rgbt.models`.
@@ -135,25 +135,25 @@ class Network(nn.Module):
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:
-    """(N, C, H, W) padded with 0 at the bottom and right to sides that `multiple` divides."""
+    """Pad (N, C, H, W) with 0 at the bottom and right to sides that `multiple` divides."""
     below, right = (-side % multiple for side in image.shape[2:])
     is_padded = isinstance(below, int) and not (below or right)  # not in a graph for any size
     return image if is_padded else F.pad(image, (0, right, 0, below))
 
 
 def luma_of(rgb: Tensor) -> Tensor:
-    """(N, 3, H, W) -> (N, 1, H, W): 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601)."""
+    """Compute 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601): (N, 3, H, W) -> (N, 1, H, W)."""
     weights = rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
     return (rgb * weights).sum(1, keepdim=True)
 
 
 def as_rgb(thermal: Tensor) -> Tensor:
-    """A thermal image (N, 1 or 3, H, W) for a branch of three channels: (N, 3, H, W)."""
+    """Expand a thermal image (N, 1 or 3, H, W) to the three channels of a branch: (N, 3, H, W)."""
     return thermal.expand(-1, 3, -1, -1)
 
 
 def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:
-    """Cells (N, h, w) to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
+    """Expand cells (N, h, w) to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
 
     `count` is the N that is expected, `image_hw` the padded size, `unit` 1 for pixels or 4 for the
     tokens of a Swin.
@@ -175,7 +175,7 @@ def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: i
 
 
 def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
-    """The requested view of a network without stacked views; InputError for another one.
+    """Return the requested view of a network without stacked views; InputError for another one.
 
     `views` as its `forward` got them (empty: the first of `known`), its views, and its name.
     """

@@ -6,6 +6,7 @@ choice is an argument. Their parameters have torchvision's names.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
@@ -35,7 +36,7 @@ def keep_factors(
     *,
     dim: int = 0,
 ) -> Tensor:
-    """Factors of what is dropped at random: 0, or 1 / (1 - rate) where kept.
+    """Draw a factor for everything that may be dropped: 0, or 1 / (1 - rate) where kept.
 
     Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
 
@@ -56,7 +57,7 @@ def keep_factors(
 def stochastic_depth(
     rates: Tensor | None, depths: Sequence[int], x: Tensor, generator: torch.Generator | None
 ) -> list[Sequence[Keep]]:
-    """A `Keep` for every block of stages with `depths` blocks, for a batch x (N, ...).
+    """Draw a `Keep` for every block of stages with `depths` blocks, for a batch x (N, ...).
 
     `rates` are those of all blocks in order; None: nothing is dropped, nothing drawn.
     """
@@ -67,12 +68,12 @@ def stochastic_depth(
 
 
 def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
-    """``x + factor * residual``; None, where nothing is dropped, is 1."""
+    """Return ``x + factor * residual``; the factor None, where nothing is dropped, is 1."""
     return x + residual if factor is None else torch.addcmul(x, residual, factor)
 
 
 def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
-    """Whole channels of (N, C, H, W) set to 0 with probability `rate`, the others rescaled.
+    """Set whole channels of (N, C, H, W) to 0 with probability `rate`, and rescale the others.
 
     Source: Tompson et al., Efficient Object Localization (spatial dropout; torch's Dropout2d).
     """
@@ -83,21 +84,14 @@ def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> 
     return x * factor[0].to(x.dtype)
 
 
-class Mlp(nn.Module):
-    """Linear, exact GELU, linear."""
-
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., C) -> (..., C)."""
-        return self.fc2(F.gelu(self.fc1(x)))
+def feed_forward(dim: int, hidden: int) -> nn.Sequential:
+    """Make a linear layer, an exact GELU and a linear layer: (..., C) -> (..., C)."""
+    layers = OrderedDict(fc1=nn.Linear(dim, hidden), act=nn.GELU(), fc2=nn.Linear(hidden, dim))
+    return nn.Sequential(layers)
 
 
 class ResidualBlock(nn.Module):
-    """Attention and a feed-forward network, each normalised before and added to its input."""
+    """Adds to its input attention, then a feed-forward network, each of the normalised input."""
 
     def __init__(
         self, dim: int, attn: nn.Module, mlp: nn.Module, *, norm_eps: float = 1e-5
@@ -116,33 +110,29 @@ class ResidualBlock(nn.Module):
 
 
 def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:
-    """InputError unless the heads of every stage, settings of `key`, divide its channels."""
+    """Refuse (InputError) heads of a stage, a setting of `key`, that do not divide its channels."""
     if any(width % number for width, number in zip(widths, heads, strict=True)):
         raise InputError(f"{key}: {list(heads)} must divide the channels {list(widths)}.")
 
 
-class UpBlock(nn.Module):
-    """Twice the size, 3x3 convolution, normalisation, PReLU with one slope (HeatNet; thesis)."""
+def up_block(in_channels: int, out_channels: int, *, align_corners: bool) -> nn.Sequential:
+    """Make a block that doubles the size: (N, in, H, W) -> (N, out, 2 H, 2 W).
 
-    def __init__(self, in_channels: int, out_channels: int, *, align_corners: bool) -> None:
-        super().__init__()
-        self.align_corners = align_corners
-        self.conv = nn.Sequential(
-            nn.Conv2d(in_channels, out_channels, 3, padding=1),
-            nn.BatchNorm2d(out_channels),
-            nn.PReLU(),
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, in, H, W) -> (N, out, 2 H, 2 W)."""
-        larger = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=self.align_corners)
-        return self.conv(larger)
+    A 3x3 convolution, normalisation and a PReLU with one slope follow (HeatNet; thesis).
+    """
+    larger = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=align_corners)
+    conv = nn.Sequential(
+        nn.Conv2d(in_channels, out_channels, 3, padding=1),
+        nn.BatchNorm2d(out_channels),
+        nn.PReLU(),
+    )
+    return nn.Sequential(OrderedDict(larger=larger, conv=conv))
 
 
 def enlarge(
     x: Tensor, blocks: Iterable[nn.Module], rates: DropRates, generator: torch.Generator | None
 ) -> Tensor:
-    """`x` (N, C, H, W) through the blocks; channels are dropped before the first and after each."""
+    """Pass `x` (N, C, H, W) through blocks; channels are dropped before the first and after all."""
     first, later = rates
     x = drop_channels(x, first, generator)
     for block in blocks:
@@ -151,7 +141,7 @@ def enlarge(
 
 
 class BasicBlock(nn.Module):
-    """Two 3x3 convolutions and a shortcut (ResNet-18 and -34; He et al., Fig. 5 left)."""
+    """Adds two 3x3 convolutions to a shortcut (ResNet-18 and -34; He et al., Fig. 5 left)."""
 
     def __init__(self, in_channels: int, width: int, *, stride: int = 1) -> None:
         super().__init__()
@@ -168,7 +158,9 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolution and a shortcut (ResNet-50 and deeper; He et al., Fig. 5 right).
+    """Adds a 1x1, a 3x3 and a 1x1 convolution to a shortcut.
+
+    Source: ResNet-50 and deeper (He et al., Fig. 5 right).
 
     `width` is that of the 3x3 convolution, which is dilated; four times as many channels leave the
     block. Its stride is at the "3x3" as torchvision has it, or the "1x1" as in Caffe (DeepLab v2).
@@ -203,7 +195,7 @@ class Bottleneck(nn.Module):
 
 
 def _shortcut(in_channels: int, out_channels: int, stride: int) -> nn.Module:
-    """Identity where shapes allow it, else a strided 1x1 convolution with normalisation."""
+    """Make an identity where shapes allow it, else a strided, normalised 1x1 convolution."""
     if stride == 1 and in_channels == out_channels:
         return nn.Identity()
     convolution = nn.Conv2d(in_channels, out_channels, 1, stride=stride, bias=False)
@@ -219,7 +211,7 @@ def bottleneck_stage(
     dilations: tuple[int, int] = (1, 1),
     stride_at: StrideAt = "3x3",
 ) -> nn.Sequential:
-    """Bottlenecks, the first strided; dilations are those of the first block and the others."""
+    """Make bottlenecks, the first one strided, with the dilations of the first and the others."""
     first, others = dilations
     made = [Bottleneck(in_channels, width, stride=stride, dilation=first, stride_at=stride_at)]
     for _ in range(blocks - 1):
@@ -228,6 +220,8 @@ def bottleneck_stage(
 
 
 def basic_stage(in_channels: int, width: int, blocks: int, *, stride: int = 1) -> nn.Sequential:
-    """Basic blocks of one width, the first strided."""
-    first = BasicBlock(in_channels, width, stride=stride)
-    return nn.Sequential(first, *(BasicBlock(width, width) for _ in range(blocks - 1)))
+    """Make basic blocks of one width, the first one strided."""
+    made = [BasicBlock(in_channels, width, stride=stride)]
+    for _ in range(blocks - 1):
+        made.append(BasicBlock(width, width))
+    return nn.Sequential(*made)

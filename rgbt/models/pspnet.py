@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.inputs import Images, Inputs, Network
-from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
+from rgbt.models.parts import DropRates, bottleneck_stage, enlarge, up_block
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
 from rgbt.requirements import NetworkRecord
 from rgbt.types import Output, View
@@ -22,7 +22,7 @@ BRANCHES = ("", "_2")  # what the released names of the first and second branch 
 
 
 class PSPNet(Network):
-    """PSPNet with ResNet-50 and without auxiliary head.
+    """Predicts from one image or both, as HeatNet does, by ResNet-50 and pyramid pooling.
 
     Two branches are concatenated at 1/8 of the size, before the third stage. Weights are drawn as
     released: convolutions N(0, 0.02), normalisations N(1, 0.02) and 0; biases of convolutions and
@@ -64,9 +64,9 @@ class PSPNet(Network):
         self.feats = PSPNetEncoder(channels.get(modalities, (thermal,)), depths, base_width)
         pooled, narrow = 16 * base_width, decoder_width
         self.psp = PyramidPooling(32 * base_width, pooled, align_corners=align_corners)
-        self.up_1 = UpBlock(pooled, 4 * narrow, align_corners=align_corners)
-        self.up_2 = UpBlock(4 * narrow, narrow, align_corners=align_corners)
-        self.up_3 = UpBlock(narrow, narrow, align_corners=align_corners)
+        self.up_1 = up_block(pooled, 4 * narrow, align_corners=align_corners)
+        self.up_2 = up_block(4 * narrow, narrow, align_corners=align_corners)
+        self.up_3 = up_block(narrow, narrow, align_corners=align_corners)
         self.final = nn.Sequential(nn.Conv2d(narrow, num_classes, 1))
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -77,7 +77,7 @@ class PSPNet(Network):
         self.inputs = inputs
 
     def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:
-        """Class scores of one image or both.
+        """Predict class scores of one image or both.
 
         In aux: maps of the encoder. With w = base_width, branches concatenated, sides H and W
         rounded up to multiples of 8 and then divided by s: "features" (32 w, s = 8), "layer3"
@@ -97,7 +97,7 @@ class PSPNet(Network):
 
 
 class PSPNetEncoder(nn.Module):
-    """ResNet whose last two stages are dilated instead of strided.
+    """Computes features of the images by a ResNet whose last two stages are dilated.
 
     Stem and first two stages exist once per image. The first block of a dilated stage is not
     dilated; after two branches the third stage keeps its width and has no projection.
@@ -120,7 +120,7 @@ class PSPNetEncoder(nn.Module):
         self.layer4 = bottleneck_stage(16 * width, 8 * width, depths[3], dilations=(1, 4))
 
     def forward(self, images: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Features by the name of their stage, see `PSPNet.predict`."""
+        """Return features by the name of their stage, see `PSPNet.predict`."""
         branches = []
         for end, image in zip(self.branches, images, strict=True):
             conv1, bn1, layer1, layer2 = (
@@ -138,7 +138,7 @@ class PSPNetEncoder(nn.Module):
 
 
 class PyramidPooling(nn.Module):
-    """Means over 1, 4, 9 and 36 cells, projected, enlarged, and joined with the map.
+    """Joins a map with its means over 1, 4, 9 and 36 cells, projected and enlarged.
 
     Source: PSPNet, Fig. 3.   Released: HeatNet, whose four branches keep all channels and have
     neither normalisation nor activation.
@@ -156,7 +156,8 @@ class PyramidPooling(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, out, h, w), >= 0."""
-        # A convolution of joined, enlarged maps is the sum of the enlarged ones of the small maps.
+        # The convolution of the joined maps is a sum with one term for each of them. The term of a
+        # small map is computed at its own size and enlarged afterwards.
         *shares, own = torch.split(self.bottleneck.weight, x.shape[1], dim=1)
         result = F.conv2d(x, own, self.bottleneck.bias)
         for stage, share in zip(self.stages, shares, strict=True):

@@ -31,7 +31,7 @@ BASIC = (18, 34)  # the others have bottlenecks, which end in four times as many
 
 
 class Upception(nn.Module):
-    """1x1, 3x3 and a third convolution, added to a shortcut, then a ReLU unless `relu` is false.
+    """Adds a 1x1, a 3x3 and a third convolution to a shortcut, then a ReLU unless `relu` is false.
 
     Block A has a 3x3 convolution and the identity, block B (`up`) a transposed convolution and a
     transposed shortcut: twice the size.
@@ -63,10 +63,9 @@ class Upception(nn.Module):
 
 
 class RTFNet(Network):
-    """RGB-thermal fusion network of Sun et al.
+    """Adds thermal features to RGB features after the stem and every stage, as Sun et al. do.
 
-    The thermal features are added to the RGB features after the stem and after each of the four
-    stages; the thermal encoder never sees the RGB image.
+    The thermal encoder never sees the RGB image.
 
     Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
 
@@ -130,12 +129,12 @@ class RTFNet(Network):
             thermal.data.copy_(rgb if rgb.shape == thermal.shape else rgb.mean(1, keepdim=True))
 
     def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:  # noqa: ARG002
-        """Class scores from both images, >= 0 where `final_relu`.
+        """Predict class scores from both images, >= 0 where `final_relu`.
 
         In aux: "features" (N, C, h, w) of the fourth stage of the RGB encoder, with those of the
         thermal one added.
         """
-        unit = {name.removeprefix("encoder_"): each for name, each in self.named_children()}
+        unit = {name.removeprefix("encoder_"): child for name, child in self.named_children()}
         x = F.relu(unit["rgb_bn1"](unit["rgb_conv1"](images.rgb)))
         y = F.relu(unit["thermal_bn1"](unit["thermal_conv1"](images.thermal)))
         x, y = unit["rgb_maxpool"](x + y), unit["thermal_maxpool"](y)

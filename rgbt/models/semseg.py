@@ -18,7 +18,7 @@ from rgbt.types import Output, View
 
 
 class SemsegPSPNet(Network):
-    """PSPNet with ResNet-50 as semseg has it: the teachers of the thesis.
+    """Predicts from one image by PSPNet with ResNet-50 as semseg has it: teachers of the thesis.
 
     It sees the RGB image or the thermal image. Scores are enlarged to the image with aligned
     corners; with sides of 8 n + 1 pixels, as semseg requires, that is exactly 8 times. Convolutions
@@ -63,13 +63,22 @@ class SemsegPSPNet(Network):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        self.ppm = SemsegPooling(32 * width, 8 * width)
+        branches = nn.ModuleList()
+        for bins in BINS:
+            branch = nn.Sequential(
+                nn.AdaptiveAvgPool2d(bins),
+                nn.Conv2d(32 * width, 8 * width, 1, bias=False),
+                nn.BatchNorm2d(8 * width),
+                nn.ReLU(),
+            )
+            branches.append(branch)
+        self.ppm = nn.ModuleDict({"features": branches})
         self.cls = _head(64 * width, 8 * width, num_classes)
         self.aux = _head(16 * width, 4 * width, num_classes)
         self.inputs = inputs
 
     def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:
-        """Class scores of one image.
+        """Predict class scores of one image.
 
         In aux: "features" (N, 32 w, h, w) of the fourth stage, with w = base_width; "aux_logits"
         (N, K, H, W) of the third stage.
@@ -78,32 +87,16 @@ class SemsegPSPNet(Network):
         x = F.max_pool2d(self.layer0(image), 3, stride=2, padding=1)
         layer3 = self.layer3(self.layer2(self.layer1(x)))
         layer4 = self.layer4(layer3)
+        # Pyramid pooling joins the map with its means over 1, 4, 9 and 36 cells.
+        pooled = [layer4]
+        for branch in self.ppm["features"].children():
+            pooled.append(_enlarged(branch(layer4), layer4.shape[2:]))
         rate = self.drop_rate if self.training else 0.0
         found = []
-        for head, features in ((self.cls, self.ppm(layer4)), (self.aux, layer3)):
+        for head, features in ((self.cls, torch.cat(pooled, 1)), (self.aux, layer3)):
             narrow = drop_channels(head[:-1](features), rate, generator)
             found.append(_enlarged(head[-1](narrow), image.shape[2:]))
         return Output(found[0], {"features": layer4, "aux_logits": found[1]})
-
-
-class SemsegPooling(nn.Module):
-    """Means over 1, 4, 9 and 36 cells, narrowed, normalised, enlarged, and joined with the map."""
-
-    def __init__(self, channels: int, narrow: int) -> None:
-        super().__init__()
-        self.features = nn.ModuleList(
-            nn.Sequential(
-                nn.AdaptiveAvgPool2d(bins),
-                nn.Conv2d(channels, narrow, 1, bias=False),
-                nn.BatchNorm2d(narrow),
-                nn.ReLU(),
-            )
-            for bins in BINS
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, C, h, w) -> (N, C + 4 narrow, h, w)."""
-        return torch.cat([x, *(_enlarged(branch(x), x.shape[2:]) for branch in self.features)], 1)
 
 
 def _enlarged(x: Tensor, hw: Sequence[int]) -> Tensor:
@@ -111,13 +104,13 @@ def _enlarged(x: Tensor, hw: Sequence[int]) -> Tensor:
 
 
 def _conv_norm(before: int, after: int, *, stride: int = 1) -> tuple[nn.Module, ...]:
-    """3x3 convolution, normalisation, ReLU."""
+    """Make a 3x3 convolution, normalisation and ReLU."""
     conv = nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False)
     return conv, nn.BatchNorm2d(after), nn.ReLU()
 
 
 def _head(channels: int, narrow: int, num_classes: int) -> nn.Sequential:
-    """The layers with semseg's numbers: 3 is its dropout, which `forward` draws."""
+    """Make layers with semseg's numbers; number 3 is its dropout, which `predict` draws."""
     return nn.Sequential(
         *_conv_norm(channels, narrow), nn.Identity(), nn.Conv2d(narrow, num_classes, 1)
     )

@@ -14,14 +14,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import Keep, Mlp, ResidualBlock, stochastic_depth
+from rgbt.models.parts import Keep, ResidualBlock, feed_forward, stochastic_depth
 
 PATCH = 4
 
 
 @dataclass(frozen=True)
 class SwinShape:
-    """Sizes of one branch; keys of ``conf/model/mask2former.yaml``."""
+    """Holds the sizes of one branch, keys of ``conf/model/mask2former.yaml``."""
 
     embed_dim: int
     depths: tuple[int, int, int, int]
@@ -32,13 +32,15 @@ class SwinShape:
 
     @property
     def widths(self) -> tuple[int, int, int, int]:
-        """Channels of the four stages."""
+        """Return the channels of the four stages."""
         c = self.embed_dim
         return c, 2 * c, 4 * c, 8 * c
 
 
 def relative_index(window: int) -> Tensor:
-    """Row of the bias table for each (query, key) pair of a window of so many tokens a side.
+    """Return the row of the bias table for each (query, key) pair of a window.
+
+    `window` is its side in tokens.
 
         index = (dy + window - 1) * (2 window - 1) + (dx + window - 1)
 
@@ -53,7 +55,7 @@ def relative_index(window: int) -> Tensor:
 
 @lru_cache(maxsize=64)
 def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.device) -> Tensor:
-    """Mask added to attention scores to separate tokens that the roll made neighbours.
+    """Make the mask that separates tokens which the roll made neighbours; scores are added to it.
 
     For a map of `hw` tokens, multiples of `window`, that was rolled by 0 < `shift` < window:
     (windows, 1, window^2, window^2) float32, 0 within a region, -100 across regions. Kept per size.
@@ -61,10 +63,11 @@ def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.devic
     """
     with torch.inference_mode(False):
         # 0 before the last window, 1 in it, 2 in the tokens that the roll brought from the front.
-        rows, columns = (
-            (position >= side - window).long() + (position >= side - shift).long()
-            for side, position in ((side, torch.arange(side)) for side in hw)
-        )
+        parts = []
+        for side in hw:
+            position = torch.arange(side)
+            parts.append((position >= side - window).long() + (position >= side - shift).long())
+        rows, columns = parts
         region = 3 * rows[:, None] + columns[None, :]
         grid = region.view(hw[0] // window, window, hw[1] // window, window)
         flat = grid.transpose(1, 2).reshape(-1, window * window)
@@ -72,26 +75,8 @@ def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.devic
         return (apart[:, None] * -100.0).to(device)
 
 
-class SwinPatchEmbed(nn.Module):
-    """One token per 4 x 4 pixels: linear map of the pixels, then layer normalisation."""
-
-    def __init__(self, in_channels: int, dim: int) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(in_channels, dim, PATCH, stride=PATCH)
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """(N, c, H, W), sides multiples of 4 -> (N, H/4, W/4, C)."""
-        n, c, height, width = image.shape
-        # The patches do not overlap: as a matrix product the result has tokens last at once.
-        patches = image.view(n, c, height // PATCH, PATCH, width // PATCH, PATCH)
-        patches = patches.permute(0, 2, 4, 1, 3, 5).flatten(3)
-        tokens = F.linear(patches, self.proj.weight.flatten(1), self.proj.bias)
-        return self.norm(tokens)
-
-
 class WindowAttention(nn.Module):
-    """Multi-head attention inside windows, with a learned bias per relative position.
+    """Attends with several heads inside windows, with a learned bias per relative position.
 
         softmax(q k' / sqrt(d) + bias + shift mask) v
 
@@ -142,7 +127,7 @@ class WindowAttention(nn.Module):
 
 
 class PatchMerging(nn.Module):
-    """Four neighbouring tokens become one of twice the width."""
+    """Merges four neighbouring tokens to one of twice the width."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -161,7 +146,7 @@ class PatchMerging(nn.Module):
 
 
 class Stage(nn.Module):
-    """Blocks of one width, every second one shifted, and the merging that follows them."""
+    """Applies blocks of one width, every second one shifted; the merging after them is here too."""
 
     def __init__(self, shape: SwinShape, index: int) -> None:
         super().__init__()
@@ -169,8 +154,8 @@ class Stage(nn.Module):
         self.blocks = nn.ModuleList()
         for block in range(shape.depths[index]):
             attention = WindowAttention(dim, heads, window, shift=block % 2 * (window // 2))
-            mlp = Mlp(dim, int(dim * shape.mlp_ratio))
-            self.blocks.append(ResidualBlock(dim, attention, mlp))
+            hidden = int(dim * shape.mlp_ratio)
+            self.blocks.append(ResidualBlock(dim, attention, feed_forward(dim, hidden)))
         self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
 
     def forward(self, x: Tensor, keeps: Sequence[Keep]) -> Tensor:
@@ -181,15 +166,18 @@ class Stage(nn.Module):
 
 
 class Swin(nn.Module):
-    """One modality's branch: four maps at strides 4, 8, 16, 32, each layer-normalised.
+    """Computes four normalised maps of one modality, at strides 4, 8, 16 and 32.
 
-    `shared` are stages to use instead of own ones, by index (Python objects are shared).
+    A token is a linear map of 4 x 4 pixels, normalised. `shared` are stages of another branch, by
+    index, which this branch uses instead of own ones.
     """
 
     def __init__(self, in_channels: int, *, shape: SwinShape, shared: dict[int, Stage]) -> None:
         super().__init__()
         self.shape = shape
-        self.patch_embed = SwinPatchEmbed(in_channels, shape.embed_dim)
+        self.patch_embed = nn.ModuleDict()
+        self.patch_embed["proj"] = nn.Conv2d(in_channels, shape.embed_dim, PATCH, stride=PATCH)
+        self.patch_embed["norm"] = nn.LayerNorm(shape.embed_dim)
         self.mask_token = nn.Parameter(torch.empty(1, shape.embed_dim, 1, 1))
         nn.init.trunc_normal_(self.mask_token, std=0.02)
         self.layers = nn.ModuleList(
@@ -201,12 +189,18 @@ class Swin(nn.Module):
     def forward(
         self, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
     ) -> list[Tensor]:
-        """Normalised maps of the four stages, (N, C_s, H/s, W/s), channels last in memory.
+        """Return normalised maps of the four stages, (N, C_s, H/s, W/s), channels last in memory.
 
         Of a normalised image (N, c, H, W), sides multiples of 32; where `hidden` (N, H/4, W/4) is
         true, the token is replaced by the mask token.
         """
-        x = self.patch_embed(image)
+        # The patches do not overlap: as a matrix product the result has tokens last at once.
+        n, c, height, width = image.shape
+        patches = image.view(n, c, height // PATCH, PATCH, width // PATCH, PATCH)
+        patches = patches.permute(0, 2, 4, 1, 3, 5).flatten(3)
+        proj, norm = self.patch_embed.children()
+        weight, bias = proj.get_parameter("weight"), proj.get_parameter("bias")
+        x = norm(F.linear(patches, weight.flatten(1), bias))
         if hidden is not None:
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
         rates = None

@@ -20,7 +20,7 @@ Real = TypeVar("Real", np.float32, np.float64)
 
 
 def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
-    """A float32 array of `values`."""
+    """Return a float32 array of `values`."""
     return np.array(values, np.float32)
 
 
@@ -33,7 +33,7 @@ NEAR_M = 0.3
 
 @dataclass(frozen=True)
 class SynthCamera:
-    """Pixels; the position in metres; radians downward (`pitch`) and to the right (`yaw`)."""
+    """Projects between world and pixels; metres, radians downward (`pitch`) and right (`yaw`)."""
 
     height: int
     width: int
@@ -44,12 +44,12 @@ class SynthCamera:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """(column, row) of the optical axis: the middle of the image."""
+        """Return (column, row) of the optical axis: the middle of the image."""
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """(3, 3) float64: rows are the camera's x, y and z axes in world coordinates."""
+        """Return (3, 3) float64: rows are the camera's x, y and z axes in world coordinates."""
         sin_yaw, cos_yaw = np.sin(self.yaw), np.cos(self.yaw)
         sin_pitch, cos_pitch = np.sin(self.pitch), np.cos(self.pitch)
         return np.array(
@@ -61,19 +61,19 @@ class SynthCamera:
         )
 
     def to_camera(self, points: NDArray[Real]) -> NDArray[Real]:
-        """World points (..., 3) in camera coordinates, in the precision they come in."""
+        """Convert world points (..., 3) to camera coordinates, in the precision they come in."""
         # One list of points: a stack of small matrices would be multiplied one by one.
         moved = points.reshape(-1, 3) - np.asarray(self.position, points.dtype)
         return (moved @ self.rotation.T.astype(points.dtype)).reshape(points.shape)
 
     def project(self, points_in_camera: Floats) -> Floats:
-        """Points (..., 3) in camera coordinates as (column, row); depth is held above `NEAR_M`."""
+        """Project points (..., 3) of the camera to (column, row); depth is held above `NEAR_M`."""
         scale = np.reciprocal(np.maximum(points_in_camera[..., 2:], np.float32(NEAR_M)))
         scale *= np.float32(self.focal)
         return points_in_camera[..., :2] * scale + floats(self.centre)
 
     def rays(self) -> Floats:
-        """(3, H, W) camera coordinates of the point at depth 1 that each pixel sees."""
+        """Return camera coordinates of the point at depth 1 that each pixel sees, (3, H, W)."""
         column, row = self.centre
         rays = np.ones((3, self.height, self.width), np.float32)
         rays[0] = (np.arange(self.width, dtype=np.float32) - column) / self.focal
@@ -81,17 +81,17 @@ class SynthCamera:
         return rays
 
     def turned(self, vectors_3HW: Floats) -> Floats:
-        """(3, H, W) vectors in camera coordinates as vectors in world coordinates."""
+        """Turn vectors (3, H, W) from camera coordinates to world coordinates."""
         flat = vectors_3HW.reshape(3, -1)
         return (self.rotation.T.astype(np.float32) @ flat).reshape(vectors_3HW.shape)
 
     def to_world(self, rays_3HW: Floats, inverse_depth_HW: Floats) -> Floats:
-        """(3, H, W) world points along `rays_3HW`; 10 km away where the inverse depth is 0."""
+        """Return world points along `rays_3HW`, (3, H, W); 10 km away where inverse depth is 0."""
         depth = np.reciprocal(np.maximum(inverse_depth_HW, np.float32(1e-4)))
         return self.turned(rays_3HW) * depth + floats(self.position)[:, None, None]
 
     def moved(self, motion: EgoMotion) -> SynthCamera:
-        """The camera after `motion`."""
+        """Return the camera after `motion`."""
         yaw, step = self.yaw + float(np.deg2rad(motion.yaw_deg)), motion.forward_m
         x, y, z = self.position
         position = (x + step * float(np.sin(yaw)), y, z + step * float(np.cos(yaw)))
@@ -99,14 +99,14 @@ class SynthCamera:
 
 
 def camera_of(factors: SceneFactors) -> SynthCamera:
-    """The camera that the factors describe, above the origin, looking along Z."""
+    """Make the camera that the factors describe, above the origin, looking along Z."""
     focal = factors.width / 2 / np.tan(np.deg2rad(factors.field_of_view_deg) / 2)
     position, pitch = (0.0, factors.camera_height_m, 0.0), np.deg2rad(factors.camera_pitch_deg)
     return SynthCamera(factors.height, factors.width, float(focal), position, float(pitch))
 
 
 def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> Floats:
-    """Displacement of each pixel of `source` to its position in `target`, for a static scene.
+    """Return the displacement of pixels of `source` to `target`, for a static scene.
 
         p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
 

@@ -36,7 +36,7 @@ from rgbt.types import SceneMaps
 
 
 def _bgr(scene: Scene) -> NDArray[np.uint8]:
-    """RGB in the order in which OpenCV stores channels."""
+    """Return RGB in the order in which OpenCV stores channels."""
     return np.ascontiguousarray(scene.rgb[..., ::-1])
 
 
@@ -51,10 +51,10 @@ SKY = 65535
 
 
 class SceneDataset(MFNet):
-    """Rendered scenes in MFNet's layout, with depth and objects of the test images."""
+    """Reads rendered scenes in MFNet's layout, with depth and objects of the test images."""
 
     def scene_maps(self, name: str) -> SceneMaps:
-        """Depth and objects of an image of the test split; InputError without such a file."""
+        """Read depth and objects of an image of the test split; InputError without such a file."""
         path = self.root / "scene" / f"{name}.png"
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if stored is None or stored.dtype != np.uint16 or stored.ndim != 3:
@@ -80,7 +80,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     ego_forward_m: ForwardMetres | None = None,
     ego_yaw_deg: YawDegrees = 0.0,
 ) -> SceneDataset:
-    """Streets in MFNet's layout, generated on first use.
+    """Return streets in MFNet's layout, generated on first use.
 
     images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
     train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
@@ -100,7 +100,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
 
 
 def _mfnet_named(shots: list[Shot]) -> list[Shot]:
-    """Names have five digits and D (day) or N (night), as in MFNet."""
+    """Name shots by five digits and D (day) or N (night), as in MFNet."""
     return [s._replace(name=f"{s.scene:05d}{'N' if s.night else 'D'}") for s in shots]
 
 
@@ -121,10 +121,12 @@ def _mfnet_images(scene: Scene, shot: Shot) -> Images:
 
 
 def _mfnet_lists(shot: Shot) -> dict[str, str]:
-    """The list of its split, and that of the test split by day or at night."""
+    """Return the list of its split, and that of the test split by day or at night."""
     time = "night" if shot.night else "day"
-    lists = [shot.split, *([f"test_{time}"] if shot.split == "test" else [])]
-    return {f"{each}.txt": shot.name for each in lists}
+    lines = {f"{shot.split}.txt": shot.name}
+    if shot.split == "test":
+        lines[f"test_{time}.txt"] = shot.name
+    return lines
 
 
 MFNET_LAYOUT = Layout(_mfnet_named, _mfnet_images, _mfnet_lists)
@@ -161,7 +163,7 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> KP:
-    """Streets in the layout of KP in the CRM release; arguments and errors as of `synth`.
+    """Return streets in the layout of KP in the CRM release; arguments and errors as of `synth`.
 
     images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg   three channels each, those of lwir equal
     labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void
@@ -175,9 +177,10 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
 
 
 def _kp_named(shots: list[Shot]) -> list[Shot]:
-    """Scenes of one time of day are spread over its recordings, in order."""
+    """Spread the scenes of one time of day over its recordings, in order."""
     named = []
-    for same in ([shot for shot in shots if shot.night == night] for night in (False, True)):
+    for night in (False, True):
+        same = [shot for shot in shots if shot.night == night]
         for number, shot in enumerate(same):
             sets = _SETS[shot.split, shot.night]
             recording, video = sets[number * len(sets) // len(same)], number // _FRAMES_PER_VIDEO
@@ -196,15 +199,16 @@ def _kp_images(scene: Scene, shot: Shot) -> Images:
 
 
 def _kp_lists(shot: Shot) -> dict[str, str]:
-    lists = (shot.split, f"{shot.split}_{'night' if shot.night else 'day'}")
-    return {f"{each}.txt": f"{shot.name}.png" for each in lists}
+    time = "night" if shot.night else "day"
+    line = f"{shot.name}.png"
+    return {f"{shot.split}.txt": line, f"{shot.split}_{time}.txt": line}
 
 
 KP_LAYOUT = Layout(_kp_named, _kp_images, _kp_lists)
 
 
 def kp_ids(scene: Scene) -> NDArray[np.uint8]:
-    """Class ids of KP, those of Cityscapes: (H, W) uint8, 0 to 19.
+    """Return class ids of KP, those of Cityscapes: (H, W) uint8, 0 to 19.
 
     Five classes are never there: traffic_light, truck, bus, train, motorcycle; vans are cars as in
     Cityscapes. Guardrails are "fence" so that there is one; Cityscapes gives them no class.
@@ -247,7 +251,7 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> PST900:
-    """Streets in the layout of the PST900 archive; arguments and errors as of `synth` and `PST900`.
+    """Return streets in the layout of PST900; arguments and errors as of `synth` and `PST900`.
 
     {train,test}/{rgb,thermal,labels}/NAME.png, NAME as in 58_bag21_rect_rgb_frame0000000440
 
@@ -314,7 +318,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     num_test: Annotated[int, Interval(ge=2, le=30_000)] = 60,
     factors: SceneFactors,
 ) -> Freiburg:
-    """Streets in the layout of Freiburg Thermal; arguments and errors as of `synth` and `Freiburg`.
+    """Return streets in the layout of Freiburg; arguments and errors as of `synth` and `Freiburg`.
 
     train/SEQUENCE/PIECE/{fl_rgb,fl_ir_aligned,fl_rgb_labels}/..._STAMP.png, no labels at night
     test/{day,night}/{ImagesRGB,ImagesIR}/STAMP_{rgb,ir}.png, SegmentationClass/STAMP_rgb.npy
@@ -341,7 +345,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
 
 
 def _freiburg_named(shots: list[Shot]) -> list[Shot]:
-    """Days, nights for training, and a test split whose second half is at night."""
+    """Name days, nights for training, and a test split whose second half is at night."""
     named = []
     for shot in shots:
         night, folder = shot.split == "train_night", f"train/{VAL_SEQUENCE}/00"
@@ -388,12 +392,12 @@ FREIBURG_LAYOUT = Layout(_freiburg_named, _freiburg_images)
 
 
 def counts_of(grey: Floats) -> NDArray[np.uint16]:
-    """Counts (H, W) uint16 of grey levels: `BLACK` is 0 and `WHITE` is 1, in a straight line."""
+    """Convert grey levels to counts (H, W) uint16: `BLACK` is 0 and `WHITE` 1, in a line."""
     return np.rint(BLACK + (WHITE - BLACK) * grey.astype(np.float64)).astype(np.uint16)
 
 
 def seen_in_thermal(height: int, width: int) -> NDArray[np.bool_]:
-    """(H, W): whether the thermal camera sees a pixel of the frame; it never moves on its mount."""
+    """Say whether the thermal camera, which never moves on its mount, sees a pixel; (H, W)."""
     size = np.array([width - 1, height - 1])
     corners = np.rint(np.array(_MARGINS) * size).astype(np.int32)
     canvas = np.zeros((height, width), np.uint8)

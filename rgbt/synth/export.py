@@ -45,7 +45,7 @@ FRAMES = "next"
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A data set: scenes by split, and the motion to a second frame; equal plans, equal files."""
+    """Describes a data set: scenes by split, motion to a second frame; equal plans, equal files."""
 
     name: str
     seed: int
@@ -55,7 +55,7 @@ class Plan:
 
 
 class Shot(NamedTuple):
-    """One scene to be written: its number, that in its split (`place` of `total`), its names."""
+    """Names one scene to be written: number, number in its split (`place` of `total`), names."""
 
     scene: int
     split: str
@@ -67,7 +67,7 @@ class Shot(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Which files a data set has.
+    """Says which files a data set has.
 
     The shots of a split with their names and folders, the files of a scene, and the split lists
     that a shot is in, if there are any, with its line.
@@ -79,18 +79,19 @@ class Layout(NamedTuple):
 
 
 def shots_of(layout: Layout, plan: Plan) -> list[Shot]:
-    """Every scene of a data set, in the order of their numbers; none is in two splits."""
+    """Return every scene of a data set, in the order of their numbers; none is in two splits."""
     shots: list[Shot] = []
     for split, total in plan.numbers.items():
-        first = len(shots)
-        nights = [is_night(plan.seed, first + n, plan.factors.night_share) for n in range(total)]
-        plain = [Shot(first + n, split, n, total, night) for n, night in enumerate(nights)]
+        first, plain = len(shots), []
+        for place in range(total):
+            night = is_night(plan.seed, first + place, plan.factors.night_share)
+            plain.append(Shot(first + place, split, place, total, night))
         shots += layout.named(plain)
     return shots
 
 
 def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
-    """The folder of a data set, written now if it is not there yet.
+    """Return the folder of a data set, written now if it is not there yet.
 
     It is renamed when complete, so that an interrupted generation leaves nothing and two cannot
     mix. `cache_dir` None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt; InputError if that is impossible.

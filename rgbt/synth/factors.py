@@ -27,7 +27,7 @@ Multiple = Annotated[float, Interval(ge=0.1, le=10)]
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFactors:
-    """The factors of a scene, see ``conf/dataset/synth.yaml``; a study varies one of them.
+    """Holds the factors of a scene, see ``conf/dataset/synth.yaml``; a study varies one of them.
 
     A gain by radius changes with the squared radius, from 1 at the centre to 1 + gain in a corner.
     """
@@ -70,7 +70,7 @@ YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Motion of the camera between two frames: it turns to the right, then it drives ahead."""
+    """Holds a motion of the camera between two frames: it turns right, then drives ahead."""
 
     forward_m: ForwardMetres
     yaw_deg: YawDegrees = 0.0
@@ -79,7 +79,7 @@ class EgoMotion:
 def with_factors(
     *left_out: str, **defaults: float
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
-    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword, as a key is.
+    """Let a function of ``factors: SceneFactors`` take every factor as a keyword, as a key is.
 
     `left_out` are factors that the data set decides itself; `defaults` are those that differ.
     """
@@ -97,13 +97,16 @@ def with_factors(
 
         @wraps(function)
         def made(**settings: Any) -> Made:
-            factors = {each.name: settings.pop(each.name, each.default) for each in added}
+            factors = {}
+            for factor in added:
+                factors[factor.name] = settings.pop(factor.name, factor.default)
             return function(factors=SceneFactors(**factors), **settings)
 
         own = inspect.signature(function)
-        kept = [each for each in own.parameters.values() if each.name != "factors"]
-        made.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
-        made.__annotations__ = {each.name: each.annotation for each in (*kept, *added)}
+        kept = [parameter for name, parameter in own.parameters.items() if name != "factors"]
+        shown = [*kept, *added]
+        made.__signature__ = own.replace(parameters=shown)  # type: ignore[attr-defined]
+        made.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
         return made
 
     return with_keywords

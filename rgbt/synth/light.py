@@ -22,7 +22,7 @@ _DARK = floats([0, 0, 0])
 
 
 class Light(NamedTuple):
-    """The light sources of a scene.
+    """Holds the light sources of a scene.
 
     Attributes:
         sun: (3,) unit vector towards the sun, whose strength is `direct`.
@@ -55,13 +55,13 @@ class Light(NamedTuple):
 
 
 def is_night(seed: int, index: int, night_share: float) -> bool:
-    """Whether scene `index` is a night scene; consecutive scenes keep the share closely."""
+    """Say whether scene `index` is a night scene; consecutive scenes keep the share closely."""
     start = numpy_generator(seed, "synth/night").random()
     return (start + index * _GOLDEN) % 1.0 < night_share
 
 
 def draw_light(seed: int, index: int, night_share: float, night_light: float = 1.0) -> Light:
-    """The light of one scene; `night_light` is a factor on everything that lights the night."""
+    """Draw the light of one scene; `night_light` is a factor on all that lights the night."""
     u = numpy_generator(seed, "synth/light", index).random(16).tolist()
     angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
     flat = math.cos(height)
@@ -81,7 +81,7 @@ def draw_light(seed: int, index: int, night_share: float, night_light: float = 1
 
 
 def _day(light: Light, u: list[float]) -> Light:
-    """Clear, or in a third of the scenes cloudy."""
+    """Make the day clear, or in a third of the scenes cloudy."""
     light = light._replace(exposure=1.25 * light.exposure)
     if u[9] < 0.35:
         grey = floats([0.74, 0.77, 0.82]) * (0.85 + 0.3 * u[10])
@@ -92,7 +92,7 @@ def _day(light: Light, u: list[float]) -> Light:
 
 
 def _night(light: Light, u: list[float], factor: float) -> Light:
-    """A dark sky with some glow at the horizon; the camera sees a little green, as MFNet's does."""
+    """Make a dark sky with some glow at the horizon; the camera sees a little green, as MFNet's."""
     single = np.float32(factor)
     return light._replace(
         ambient=(0.010 + 0.022 * u[10]) * factor,
@@ -113,7 +113,7 @@ Lamp = tuple[tuple[float, float, float], Floats, float]
 
 
 def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
-    """(3, H, W) light of all lamps at each world point; strength / (1 + (distance / reach)^2)^2."""
+    """Add the light of all lamps, strength / (1 + (distance / reach)^2)^2, at points (3, H, W)."""
     if not lamps:
         return np.zeros_like(world_3HW)
     points = world_3HW.reshape(3, -1)
@@ -127,7 +127,7 @@ def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
 
 
 def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
-    """(H, W) light of the own low beams: a pool ahead, cut off at the waist."""
+    """Return the light of the own low beams, (H, W): a pool ahead, cut off at the waist."""
     dx, dz = world_3HW[0] - camera.position[0], world_3HW[2] - camera.position[2]
     sin, cos = np.float32(np.sin(camera.yaw)), np.float32(np.cos(camera.yaw))
     ahead, aside = np.maximum(dx * sin + dz * cos, 0.1), dx * cos - dz * sin
@@ -139,16 +139,18 @@ def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
 
 
 def is_oncoming(thing: Placed) -> bool:
-    """Whether it is a car whose headlights point at the camera."""
+    """Say whether it is a car whose headlights point at the camera."""
     return thing.shape.name.startswith("car_") and math.cos(thing.yaw) < 0
 
 
 def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
-    """The nearest lamps that light their surroundings; `placed` is sorted far to near."""
+    """Return the nearest lamps that light their surroundings; `placed` is sorted far to near."""
     lamps: list[Lamp] = []
     others = np.float32(light.others)
-    for thing in (thing for thing in placed if thing.lit):
+    for thing in placed:
         x, z = thing.x, thing.z
+        if not thing.lit:
+            continue
         if thing.shape.name == "street_lamp":
             lamps.append(((x + 1.35 * math.cos(thing.yaw), 5.4, z), light.lamp, 5.5))
         elif thing.shape.name == "vending_machine":
@@ -167,7 +169,7 @@ _REACH = 0.16
 def veil_of(
     placed: Sequence[Placed], camera: SynthCamera, light: Light, strength: float, key: Key
 ) -> Floats | None:
-    """(3, H, W) light that is added to the image; None where there is no source of glare.
+    """Return light (3, H, W) to add to the image; None where there is no source of glare.
 
     Headlights 10 m ahead have the brightness `strength`, 1 = white of the day. In a share of the
     clear days the sun is low at the end of the road.
@@ -177,7 +179,9 @@ def veil_of(
     height, width = camera.height, camera.width
     sources = []
     if light.is_night:
-        for thing in (thing for thing in placed if thing.lit and is_oncoming(thing)):
+        for thing in placed:
+            if not (thing.lit and is_oncoming(thing)):
+                continue
             point = camera.to_camera(floats([thing.x, 0.7, thing.z]))
             column, row = camera.project(point).tolist()
             if 0 <= column < width and 0 <= row < height and point[2] > NEAR_M:

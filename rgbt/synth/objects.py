@@ -41,7 +41,7 @@ At = tuple[float, float]
 
 
 def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> list[Placed]:
-    """All labelled objects of a scene except kerbs; with more of them, the first stay the same."""
+    """Place all labelled objects of a scene but kerbs; with more of them, the first stay."""
     u = numpy_generator(seed, "synth/structures", index).random(8).tolist()
     near = draw_rows(seed, index, "near", factors.num_objects * _MAX_GROUP)
     placed = _structures(road, u, factors)
@@ -78,7 +78,7 @@ def _overlap(one: Placed, other: Placed) -> bool:
 
 
 def _far_object(road: Road, row: Row, factors: SceneFactors) -> Placed:
-    """One small object around the vanishing point."""
+    """Place one small object around the vanishing point."""
     kind = bisect(_FAR_SHARES[factors.object_mix], row[0])
     z = _FAR_Z[0] * (_FAR_Z[1] / _FAR_Z[0]) ** row[1]
     lateral = (2 * row[2] - 1) * (road.half_width + 1.5)
@@ -94,12 +94,13 @@ def _far_object(road: Road, row: Row, factors: SceneFactors) -> Placed:
         thing = _stop(road, row, (z, lateral), int(row[5] * len(_STOPS)))
     else:
         thing = road.place("cone", z, lateral)
-    across, up, along = (factors.far_object_scale * each for each in thing.scale)
-    return thing._replace(scale=(across, up, along))
+    across, up, along = thing.scale
+    factor = factors.far_object_scale
+    return thing._replace(scale=(factor * across, factor * up, factor * along))
 
 
 def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Placed]:
-    """Guardrails along one side and a bump across the road, each in a share of the scenes."""
+    """Place guardrails along one side and a bump across the road, in a share of the scenes each."""
     placed = []
     if u[0] < factors.rail_share:
         lateral = (-1 if u[1] < 0.5 else 1) * (road.half_width + 0.45)
@@ -123,7 +124,7 @@ def _paint(palette: list[Paint], u: float, shade: float) -> Paint:
 
 
 def _car(road: Road, row: Row, at: At, parked: bool) -> Placed:
-    """A car: parked ones are cold and dark, moving ones warm and lit."""
+    """Place a car: parked ones are cold and dark, moving ones warm and lit."""
     away = at[1] < 0 if row[4] < 0.85 else at[1] >= 0
     paint = _paint(_CAR_PAINTS, row[COLOUR], 0.75 + 0.4 * row[COLOUR + 1])
     return road.place(
@@ -137,7 +138,7 @@ def _car(road: Road, row: Row, at: At, parked: bool) -> Placed:
 
 
 def _person(road: Road, row: Row, at: At) -> Placed:
-    """A person; one in eight is dressed so warmly that little of them shows in thermal."""
+    """Place a person; one in eight is dressed so warmly that little of them shows in thermal."""
     size, wrapped = 0.90 + 0.16 * row[6], row[HEAT + 1] < 0.12
     return road.place(
         f"person_{int(row[5] * 6)}",
@@ -155,7 +156,7 @@ def _outfit(row: Row) -> tuple[Paint, Paint]:
 
 
 def _bike(road: Road, row: Row, at: At, yaw: float, ridden: bool) -> Placed:
-    """A bike, with its rider where it is ridden."""
+    """Place a bike, with its rider where it is ridden."""
     frame = _paint(_CAR_PAINTS, row[COLOUR], 0.9)
     return road.place(
         "bike_ridden" if ridden else "bike_parked",
@@ -167,12 +168,12 @@ def _bike(road: Road, row: Row, at: At, yaw: float, ridden: bool) -> Placed:
 
 
 def _stop(road: Road, row: Row, at: At, kind: int) -> Placed:
-    """A car stop, roughly along the road."""
+    """Place a car stop, roughly along the road."""
     return road.place(_STOPS[kind], *at, yaw=road.heading(at[0]) + 0.2 * (row[4] - 0.5))
 
 
 def _cars(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
-    """One car: parked at the kerb or on the sidewalk, oncoming, or ahead in the own lane."""
+    """Place a car: parked at the kerb or on the sidewalk, oncoming, or ahead in the own lane."""
     u = rows[0]
     parked = u[2] < 0.5
     lateral = side * (road.half_width - 1.0 if parked else road.half_width * 0.45)
@@ -184,7 +185,7 @@ def _cars(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
 
 
 def _persons(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
-    """One to three persons on a sidewalk or crossing the road."""
+    """Place one to three persons on a sidewalk or crossing the road."""
     u = rows[0]
     lateral = side * (road.half_width + 0.5 + u[2] * (road.sidewalk_of(side) - 0.7))
     if u[3] < 0.3:
@@ -197,7 +198,7 @@ def _persons(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
 
 
 def _bikes(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
-    """A rack of parked bikes, or one ridden along the edge of the road."""
+    """Place a rack of parked bikes, or one ridden along the edge of the road."""
     u = rows[0]
     if u[2] < 0.3:
         z = max(z, 6.0)
@@ -213,7 +214,7 @@ def _bikes(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
 
 
 def _stops(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
-    """A row of two to four car stops: blocks beside the lane, or bollards along the sidewalk."""
+    """Place two to four car stops: blocks beside the lane, or bollards along the sidewalk."""
     u = rows[0]
     kind = int(u[2] * len(_STOPS))
     step, beside = ((2.4, -0.55), (1.7, 0.55), (1.9, -0.55))[kind]
@@ -223,7 +224,7 @@ def _stops(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
 
 
 def _cones(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
-    """A row of three to five cones that slants into the road."""
+    """Place a row of three to five cones that slants into the road."""
     u = rows[0]
     start, slant = side * (road.half_width - 0.35), -side * (0.1 + 0.25 * u[3])
     step, size = 1.0 + 0.8 * u[2], (0.9 + 0.35 * u[4],) * 3
@@ -248,7 +249,7 @@ _LAST_Z, _FAR_TREE_M = 85.0, 22.0
 
 
 def place_scenery(seed: int, index: int, road: Road) -> list[Placed]:
-    """Everything unlabelled that stands in a scene."""
+    """Place everything unlabelled that stands in a scene."""
     rows = draw_rows(seed, index, "scenery", 120)
     placed = _horizon(rows[:12])
     for side, own in ((-1, rows[20:60]), (1, rows[60:100])):
@@ -265,7 +266,7 @@ def _shaded(paint: Paint, shade: float) -> tuple[Paint, Paint]:
 
 
 def _horizon(rows: list[Row]) -> list[Placed]:
-    """Blocks and tree lines far away."""
+    """Place blocks and tree lines far away."""
     placed = []
     for number, u in enumerate(rows):
         x, z = (number + u[0] - 6) * 32, 190 + 60 * u[1]
@@ -279,7 +280,7 @@ def _horizon(rows: list[Row]) -> list[Placed]:
 
 
 def _plots(road: Road, rows: list[Row], side: int) -> list[Placed]:
-    """Plots along one side: each a building, or a wall or hedge with trees behind."""
+    """Place plots along one side: a building each, or a wall or hedge with trees behind."""
     town = rows[0][1]
     edge = side * (road.half_width + road.sidewalk_of(side) + 0.4)
     placed: list[Placed] = []
@@ -299,7 +300,7 @@ Plot = tuple[float, float, float]
 
 
 def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:
-    """A house, in some cases with a warm outlet on its wall."""
+    """Place a house, in some cases with a warm outlet on its wall."""
     z, length, edge = plot
     side = math.copysign(1.0, edge)
     depth, height = 9 + 6 * row[4], 4.5 + 13 * row[5] ** 1.5
@@ -315,7 +316,7 @@ def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:
 
 
 def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
-    """A wall or a hedge along the plot with two trees behind."""
+    """Place a wall or a hedge along the plot with two trees behind."""
     z, length, edge = plot
     side = math.copysign(1.0, edge)
     lateral = edge + side * 0.4
@@ -334,14 +335,14 @@ def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
 
 
 def _tree(road: Road, at: At, size: float, u: float, layer: int = BACKDROP) -> Placed:
-    """A tree; far ones have no branches, and three blobs of leaves rather than six."""
+    """Place a tree; far ones have no branches, and three blobs of leaves rather than six."""
     name = "tree" if at[0] < _FAR_TREE_M else "far_tree"
     scale = (size * 1.1, size, size)
     return road.place(f"{name}_{int(u * 5)}", *at, scale=scale, layer=layer, shadow_from=0.35)
 
 
 def _street_trees(road: Road, rows: list[Row], side: int) -> list[Placed]:
-    """Trees on the sidewalk in about half of the streets."""
+    """Place trees on the sidewalk in about half of the streets."""
     u = rows[0]
     if u[0] > 0.5:
         return []
@@ -354,7 +355,7 @@ def _street_trees(road: Road, rows: list[Row], side: int) -> list[Placed]:
 
 
 def _signs(road: Road, rows: list[Row], side: int) -> list[Placed]:
-    """Up to two traffic signs, and in some streets a vending machine, on the sidewalk."""
+    """Place up to two traffic signs, and in some streets a vending machine, on the sidewalk."""
     at = side * (road.half_width + 0.4)
     placed = [
         road.place(f"sign_{int(u[2] * 3)}", 7 + 24 * u[1], at, shadow_from=NO_SHADOW)
@@ -369,7 +370,7 @@ def _signs(road: Road, rows: list[Row], side: int) -> list[Placed]:
 
 
 def _poles(road: Road, u: Row) -> list[Placed]:
-    """Street lamps on one side; utility poles with cables on the other, in most streets."""
+    """Place street lamps on one side; in most streets, utility poles with cables on the other."""
     side = 1 if u[0] < 0.5 else -1
     lateral = side * (road.half_width + 0.45)
     yaw = 0.0 if side < 0 else math.pi

@@ -50,7 +50,7 @@ _LEVEL, _PER_DEGREE = 0.21, 0.026
 
 @dataclass(frozen=True)
 class Scene:
-    """One frame; the label has MFNet's class ids 0..8.
+    """Holds one frame; the label has MFNet's class ids 0..8.
 
     Attributes:
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
@@ -73,7 +73,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class ScenePair:
-    """Two consecutive frames of one scene in which nothing moves but the camera.
+    """Holds two consecutive frames of one scene in which nothing moves but the camera.
 
     For each pixel of `second`, `flow` (H, W, 2) float32 is the displacement (rows, columns) to its
     surface point in `first`, NaN behind that camera; `visible` (H, W): whether that is seen.
@@ -89,12 +89,12 @@ World = tuple[Facets, list[Placed], Light]
 
 
 def render_scene(seed: int, index: int, factors: SceneFactors) -> Scene:
-    """Scene `index` (>= 0) of the endless data set `seed`; equal arguments give equal bytes."""
+    """Render scene `index` (>= 0) of the endless data set `seed`; equal arguments, equal bytes."""
     return _frame(_world(seed, index, factors), camera_of(factors), factors, (seed, index, 0))
 
 
 def render_pair(seed: int, index: int, factors: SceneFactors, motion: EgoMotion) -> ScenePair:
-    """Scene `index`, as of `render_scene`, and after the camera's `motion`, with exact flow.
+    """Render scene `index` as `render_scene` does, and after a `motion`, with exact flow.
 
     Texture, light and thermal drift stay, sensor noise is drawn anew.
     """
@@ -141,18 +141,18 @@ def _frame(
 
 
 def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
-    """Pixels of `second` whose surface point is inside `first` and the nearest thing there."""
+    """Find pixels of `second` whose surface point is inside `first` and the nearest thing there."""
     height, width = second.depth.shape
     rows, columns = np.mgrid[:height, :width]
     target_rows, target_columns = rows + flow[..., 0], columns + flow[..., 1]
     inside = (target_rows >= 0) & (target_rows <= height - 1)
     inside &= (target_columns >= 0) & (target_columns <= width - 1)
-    targets = (target_rows, target_columns)
-    nearest = tuple(np.rint(np.where(inside, each, 0)).astype(int) for each in targets)
+    nearest_rows = np.rint(np.where(inside, target_rows, 0)).astype(int)
+    nearest_columns = np.rint(np.where(inside, target_columns, 0)).astype(int)
     points = second.camera.to_world(second.camera.rays(), 1.0 / second.depth)
     expected = first.camera.to_camera(np.moveaxis(points, 0, 2).astype(np.float64))[..., 2]
     expected = np.where(np.isinf(second.depth), np.inf, expected).astype(np.float32)
-    found = first.depth[nearest]
+    found = first.depth[nearest_rows, nearest_columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         agrees = np.abs(1 / found - 1 / expected) < 0.03 / expected + 2e-3
     return np.asarray(inside & agrees)
@@ -161,7 +161,7 @@ def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
 def render_rgb(
     surface: Surface, light: Light, placed: list[Placed], factors: SceneFactors, key: Key
 ) -> Floats:
-    """Light that reaches the sensor: (3, H, W) float32 in 0..1, gamma-encoded, without noise."""
+    """Render the light that reaches the sensor: (3, H, W) in 0..1, gamma-encoded, no noise."""
     strength = texture_strength(factors)
     colour = average(_colour_table(surface, light), surface.drawing)
     glow = average(_glow_table(surface.facets, light), surface.drawing)
@@ -195,7 +195,7 @@ def render_rgb(
 
 
 def _colour_table(surface: Surface, light: Light) -> NDArray[np.uint8]:
-    """(N + 1, 4): square root of reflectance times the facet's share of sun and sky."""
+    """Return the square root of reflectance times the facet's share of sun and sky, (N + 1, 4)."""
     colour = surface.facets.colour
     if light.is_night:
         shade = np.full(len(colour), 0.9, np.float32)
@@ -209,7 +209,7 @@ def _colour_table(surface: Surface, light: Light) -> NDArray[np.uint8]:
 
 
 def _glow_table(facets: Facets, light: Light) -> NDArray[np.uint8]:
-    """(N + 1, 4): square root of what lamps give off; last column: is sky."""
+    """Return the square root of what lamps give off, (N + 1, 4); the last column says sky."""
     table = np.zeros((len(facets.material) + 1, 4), np.uint8)
     table[0, 3] = 255
     if light.is_night:
@@ -219,7 +219,7 @@ def _glow_table(facets: Facets, light: Light) -> NDArray[np.uint8]:
 
 
 def _decoded(encoded_HW4: NDArray[np.uint8]) -> Floats:
-    """First three of four channels, (3, H, W), squared: the tables hold square roots."""
+    """Square the first three of four channels, (3, H, W): the tables hold square roots."""
     value = np.moveaxis(encoded_HW4[..., :3], 2, 0).astype(np.float32, order="C")
     value *= np.float32(1 / 255)
     return value * value
@@ -234,7 +234,7 @@ def _lamplight(surface: Surface, light: Light, placed: list[Placed]) -> Floats:
 
 
 def _bloom(shining: Floats) -> Floats:
-    """Light scattered in the lens: a narrow and a wide halo."""
+    """Scatter light in the lens: a narrow and a wide halo."""
     _, height, width = shining.shape
     halo = np.empty_like(shining)
     for plane, out in zip(shining, halo, strict=True):
@@ -246,7 +246,7 @@ def _bloom(shining: Floats) -> Floats:
 
 
 def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
-    """(3, H, W) colour of the sky in the direction of each pixel."""
+    """Return the colour of the sky in the direction of each pixel, (3, H, W)."""
     x, y, z = camera.turned(rays)
     up = np.maximum(y / np.sqrt(x * x + y * y + z * z), 0)
     high = np.sqrt(np.minimum(up * 1.8, 1))
@@ -261,7 +261,7 @@ def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
 def develop_rgb(
     image: Floats, factors: SceneFactors, generator: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Vignette, noise and eight bits of an image (3, H, W) in 0..1: (H, W, 3) uint8.
+    """Give vignette, noise and eight bits to an image (3, H, W) in 0..1: (H, W, 3) uint8.
 
         sd(p) = rgb_noise (1 + radius_gain r(p)^2) (1 + dark_gain (1 - mean of the image))
 
@@ -277,7 +277,7 @@ def develop_rgb(
 
 
 def texture_strength(factors: SceneFactors) -> Floats | float:
-    """Factor on the texture, (H, W) where it changes with the radius."""
+    """Return the factor on the texture, (H, W) where it changes with the radius."""
     if factors.texture_radius_gain == 0:
         return factors.texture_strength
     growth = 1 + factors.texture_radius_gain * squared_radius(factors.height, factors.width)
@@ -285,7 +285,7 @@ def texture_strength(factors: SceneFactors) -> Floats | float:
 
 
 def eight_bits(image: Floats) -> NDArray[np.uint8]:
-    """An image in 0..1 as bytes; values outside are clipped. The image is overwritten."""
+    """Convert an image in 0..1 to bytes; values outside are clipped. The image is overwritten."""
     image *= 255
     image += 0.5
     np.clip(image, 0, 255, out=image)
@@ -294,7 +294,7 @@ def eight_bits(image: Floats) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=8)
 def squared_radius(height: int, width: int) -> Floats:
-    """(H, W) float32: squared distance from the image centre, 1 at the corners."""
+    """Return the squared distance from the image centre, (H, W) float32, 1 at the corners."""
     rows = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     columns = np.linspace(-1, 1, width, dtype=np.float32)
     aspect = np.float32(height / width)
@@ -302,7 +302,7 @@ def squared_radius(height: int, width: int) -> Floats:
 
 
 def render_thermal(surface: Surface, light: Light, factors: SceneFactors) -> Floats:
-    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy."""
+    """Render the temperature of each pixel, (H, W) degrees above the air; not blurred or noisy."""
     strength = texture_strength(factors)
     table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
     degrees = np.concatenate([[-34.0], _facet_degrees(surface, light, factors)])
@@ -339,7 +339,7 @@ def _facet_degrees(surface: Surface, light: Light, factors: SceneFactors) -> Flo
 def develop_thermal(
     heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
 ) -> Floats:
-    """Contrast, lens, drift and noise of `heat` (H, W): grey levels, some below 0 or above 1.
+    """Convert `heat` (H, W) to grey levels, some below 0 or above 1, with drift and noise.
 
     The noise is per pixel, per column, and smeared over neighbours, from `generator`. The drift, an
     offset that varies slowly and a gain, belongs to the scene.
@@ -361,5 +361,5 @@ def develop_thermal(
 
 
 def _softened(image: Floats) -> Floats:
-    """The thermal lens is softer than the RGB lens: 0.7 pixels at a width of 160."""
+    """Blur as the thermal lens, which is softer than that of RGB: 0.7 pixels of 160."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7 * image.shape[1] / 160))

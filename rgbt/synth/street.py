@@ -49,7 +49,7 @@ INDEX = {row["name"]: number for number, row in enumerate(_MATERIALS)}
 
 
 def column(*fields: str) -> NDArray[np.float32]:
-    """Columns of the table of materials: (M,) of one, (M, n) of several; rows as in `INDEX`."""
+    """Return columns of the table of materials: (M,) of one, (M, n) of several, as in `INDEX`."""
     values = [[float(row[field]) for field in fields] for row in _MATERIALS]
     found = np.array(values, np.float32)
     return found[:, 0] if len(fields) == 1 else found
@@ -59,7 +59,7 @@ COLOURS = column("red", "green", "blue")
 
 
 def paints(palette: str) -> list[Paint]:
-    """The paints of cars, clothes or facades in ``paints.csv``."""
+    """Read the paints of cars, clothes or facades in ``paints.csv``."""
     rows = [row for row in _table("paints.csv") if row["palette"] == palette]
     return [(float(row["red"]), float(row["green"]), float(row["blue"])) for row in rows]
 
@@ -69,7 +69,7 @@ Table = NDArray[np.uint8]
 
 
 def class_table(classes: Sequence[str], by_label: Sequence[str], scenery: str) -> Table:
-    """The class of every pair of label and material; ids follow the order of `classes`.
+    """Return the class of every pair of label and material; ids follow the order of `classes`.
 
     `by_label` has the classes of MFNet's labels from 1 on, whatever the material; `scenery` is the
     column of the table of materials for what MFNet leaves unlabelled (0).
@@ -85,7 +85,7 @@ def class_table(classes: Sequence[str], by_label: Sequence[str], scenery: str) -
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The faces of one kind of object, as arrays in drawing order.
+    """Holds the faces of one kind of object, as arrays in drawing order.
 
     Attributes:
         corners: (F, 8, 3) float32, of which `num_corners` (F,) differ.
@@ -105,18 +105,18 @@ class Shape:
 
     @classmethod
     def of(cls, name: str, faces: Sequence[tuple[NDArray[np.float32], Sequence[int]]]) -> Shape:
-        """The shape of faces: corners (n, 3) and a row of `meta` each."""
+        """Make the shape of faces: corners (n, 3) and a row of `meta` each."""
         outlines, meta = zip(*faces, strict=True)
-        counts = np.array([len(each) for each in outlines], np.intp)
+        counts = np.array([len(outline) for outline in outlines], np.intp)
         at = np.arange(MAX_CORNERS)
-        corners = np.stack([each[at.clip(max=len(each) - 1)] for each in outlines])
+        corners = np.stack([outline[at.clip(max=len(outline) - 1)] for outline in outlines])
         half_width, height, half_length = np.abs(corners).max((0, 1)).tolist()
         return cls(name, corners, counts, np.array(meta, np.intp), half_width, half_length, height)
 
 
 @cache
 def shapes() -> dict[str, Shape]:
-    """Every shape of the table, by name."""
+    """Read every shape of the table, by name."""
     found = {}
     for name, rows in groupby(_table("shapes.csv"), key=lambda row: row["shape"]):
         faces = [
@@ -137,7 +137,7 @@ NO_SHADOW = -1.0
 
 
 class Placed(NamedTuple):
-    """One object in the world, `x` metres right of the camera's start, `z` ahead, `y` above ground.
+    """Places an object `x` metres right of the camera's start, `z` ahead, `y` above the ground.
 
     Attributes:
         yaw: turn to the right in radians; 0 shows the shape's back.
@@ -168,7 +168,7 @@ COLOUR, HEAT = 8, 12
 
 
 def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
-    """Numbers for the first `num` objects of the pool `pool` in scene `index`, row by row."""
+    """Draw numbers for the first `num` objects of the pool `pool` in scene `index`, row by row."""
     rows: list[Row] = numpy_generator(seed, f"synth/{pool}", index).random((num, 14)).tolist()
     return rows
 
@@ -181,7 +181,7 @@ Numbers = float | NDArray[np.float64] | Floats
 
 
 class Road(NamedTuple):
-    """Course and cross-section, in metres; pairs are (left, right).
+    """Describes course and cross-section, in metres; pairs are (left, right).
 
     Attributes:
         half_width: from the centre line to the kerb.
@@ -207,24 +207,24 @@ class Road(NamedTuple):
     manhole: tuple[float, float]
 
     def x(self, z: float, lateral: float) -> float:
-        """X of a point `lateral` metres right of the centre line at distance `z`."""
+        """Return X of a point `lateral` metres right of the centre line at distance `z`."""
         return self.centre + lateral + 0.5 * self.curvature * z * z
 
     def heading(self, z: float) -> float:
-        """Direction of the road at distance `z`, radians to the right of Z."""
+        """Return the direction of the road at distance `z`, radians to the right of Z."""
         return math.atan(self.curvature * z)
 
     def sidewalk_of(self, side: int) -> float:
-        """Width of the sidewalk of a side, -1 left or 1 right."""
+        """Return the width of the sidewalk of a side, -1 left or 1 right."""
         return self.sidewalk[0 if side < 0 else 1]
 
     def place(self, name: str, z: float, lateral: float, **settings: Any) -> Placed:
-        """The shape of this name `lateral` metres right of the centre line at distance `z`."""
+        """Place the shape `name` `lateral` metres right of the centre line at distance `z`."""
         return Placed(shapes()[name], self.x(z, lateral), z, **settings)
 
 
 def draw_road(seed: int, index: int, factors: SceneFactors) -> Road:
-    """The road of one scene."""
+    """Draw the road of one scene."""
     generator = numpy_generator(seed, "synth/road", index)
     u = generator.random(16).tolist()
     half_width = 2.7 + 1.2 * u[0]
@@ -251,7 +251,7 @@ TERRAIN = [(-2500.0, -2.0), (-2500.0, 2500.0), (2500.0, 2500.0), *[(2500.0, -2.0
 
 
 def ground_quads(road: Road) -> Quads:
-    """Terrain, sidewalks, asphalt, markings, kerbs and a manhole, from bottom to top."""
+    """Make terrain, sidewalks, asphalt, markings, kerbs and a manhole, from bottom to top."""
     w, (left, right) = road.half_width, road.sidewalk
     z, x, width, length = road.patches.T
     strips = [
@@ -262,7 +262,9 @@ def ground_quads(road: Road) -> Quads:
         *(("line", UNLABELED, rows) for rows in _markings(road)),
     ]
     wide, high = road.kerb_m
-    for side in (side for side, present in zip((-1, 1), road.kerb, strict=True) if present):
+    for side, present in zip((-1, 1), road.kerb, strict=True):
+        if not present:
+            continue
         top, face = _strip(side * w, side * (w + wide), (high, high)), (0, high)
         strips.append(("kerb_top", CURVE, top))
         strips.append(("kerb_face", CURVE, _strip(side * w, side * w, face)))
@@ -271,7 +273,8 @@ def ground_quads(road: Road) -> Quads:
     z, x = road.manhole[0], road.x(*road.manhole)
     angles = [2 * math.pi * corner / MAX_CORNERS for corner in range(MAX_CORNERS)]
     circle = [(x + 0.36 * math.cos(angle), z + 0.36 * math.sin(angle)) for angle in angles]
-    terrain, manhole = (floats([[(x, 0, z) for x, z in each]]) for each in (TERRAIN, circle))
+    terrain = floats([[(x, 0, z) for x, z in TERRAIN]])
+    manhole = floats([[(x, 0, z) for x, z in circle]])
     return (
         np.concatenate([terrain, _corners(road, np.concatenate(rows)), manhole]),
         np.repeat([INDEX[name] for name in ("grass", *names, "manhole")], counts),
@@ -282,7 +285,7 @@ def ground_quads(road: Road) -> Quads:
 def _rows(
     start: Numbers, end: Numbers, left: Numbers, right: Numbers, y: tuple[float, float] = (0, 0)
 ) -> Floats:
-    """Quads as rows: Z of both ends, lateral position of both sides, height of both sides."""
+    """Make rows of quads: Z of both ends, lateral position of both sides, height of both sides."""
     columns = (start, end, left, right, *y)
     rows = np.empty((max(map(np.size, columns)), 6), np.float32)
     for number, column in enumerate(columns):
@@ -291,12 +294,12 @@ def _rows(
 
 
 def _strip(left: float, right: float, y: tuple[float, float] = (0, 0)) -> Floats:
-    """A strip along the whole road."""
+    """Make a strip along the whole road."""
     return _rows(_STEPS[:-1], _STEPS[1:], left, right, y)
 
 
 def _corners(road: Road, rows: Floats) -> Floats:
-    """Corners (n, 8, 3) of quads given as rows, bent along the road."""
+    """Return corners (n, 8, 3) of quads given as rows, bent along the road."""
     corners = np.empty((len(rows), MAX_CORNERS, 3), np.float32)
     ends, sides, heights = rows[:, [0, 1, 1, 0]], rows[:, [2, 2, 3, 3]], rows[:, [4, 4, 5, 5]]
     corners[:, :4, 0] = sides + road.centre + 0.5 * road.curvature * ends * ends
@@ -307,7 +310,7 @@ def _corners(road: Road, rows: Floats) -> Floats:
 
 
 def _markings(road: Road) -> list[Floats]:
-    """Dashes along the middle; in some streets edge lines, a zebra crossing with a stop line."""
+    """Make dashes along the middle; in some streets edge lines, a crossing with a stop line."""
     starts = np.arange(14) * 5.0 - 5.0 * road.line_phase
     lines = [_rows(starts, starts + 2.6, -0.07, 0.07)]
     if road.edge_line:

@@ -32,7 +32,7 @@ _FACADES = [INDEX["facade"], INDEX["facade_side"]]
 
 @dataclass(frozen=True)
 class Facets:
-    """N facets, far to near: (N,) each, corners (N, 8, 3) world points, colour (N, 3) reflectance.
+    """Holds N facets, far to near: (N,) each, corners (N, 8, 3) world points, colour (N, 3).
 
     `warmth` and `lit` are as in `Placed`; what is `on_ground` lies flat and receives shadows;
     `owner` is the number of the object, -1 the ground.
@@ -56,7 +56,7 @@ def sorted_for_drawing(placed: Sequence[Placed]) -> list[Placed]:
 
 
 def facets_of(ground: Quads, placed: Sequence[Placed]) -> Facets:
-    """The ground's quads, then the parts of `placed`, one or more, in the order given."""
+    """Join the ground's quads and the parts of `placed`, one or more, in the order given."""
     shapes = [thing.shape for thing in placed]
     owner = np.repeat(np.arange(len(placed)), [len(shape.meta) for shape in shapes])
     # One table of numbers per object: many small arrays would cost more than all the arithmetic.
@@ -88,7 +88,7 @@ def facets_of(ground: Quads, placed: Sequence[Placed]) -> Facets:
 
 
 def _in_world(local: Floats, numbers: Floats) -> Floats:
-    """Corners scaled, turned about the upright axis and moved to where each object stands."""
+    """Scale corners, turn them about the upright axis and move them to where an object stands."""
     x, y, z, yaw = numbers[:, :4].T[:, :, None]
     scaled = local * numbers[:, None, 6:9]
     sin, cos = np.sin(yaw), np.cos(yaw)
@@ -101,7 +101,7 @@ def _in_world(local: Floats, numbers: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What the camera sees, as numbers of facets; 0 is the sky, n + 1 is facet n.
+    """Says what the camera sees, by numbers of facets; 0 is the sky, n + 1 is facet n.
 
     Attributes:
         fine: (2H, 2W); the entry (2i, 2j) lies at the centre of pixel (i, j).
@@ -118,7 +118,7 @@ class Drawing:
     normals: Floats
 
     def inverse_depth(self, rays_3HW: Floats) -> Floats:
-        """(H, W) float32, 1 / metres along the optical axis, 0 for the sky."""
+        """Return 1 / metres along the optical axis, (H, W) float32, 0 for the sky."""
         total = np.zeros(self.ids.shape, np.float32)
         for plane, ray in zip(np.ascontiguousarray(self.planes.T), rays_3HW, strict=True):
             total += np.take(plane, self.ids) * ray
@@ -128,7 +128,7 @@ class Drawing:
 
 
 def draw(facets: Facets, camera: SynthCamera) -> Drawing:
-    """Facets in their order, later ones over earlier ones."""
+    """Draw facets in their order, later ones over earlier ones."""
     corners = camera.to_camera(facets.corners)
     # In double precision: the terrain is a plane through corners kilometres away.
     three = camera.to_camera(facets.corners[:, :3].astype(np.float64))
@@ -154,13 +154,13 @@ def draw(facets: Facets, camera: SynthCamera) -> Drawing:
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Row by row; np.cross takes ten times as long on arrays of this size."""
+    """Multiply row by row; np.cross takes ten times as long on arrays of this size."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def average(values_N4: NDArray[np.uint8], drawing: Drawing) -> NDArray[np.uint8]:
-    """Four values per facet, averaged around each pixel (binomial weights, 0.5 pixels wide).
+    """Average four values per facet around each pixel (binomial weights, 0.5 pixels wide).
 
     From (N + 1, 4) uint8, row 0 for the sky, to (H, W, 4) uint8.
     """
@@ -201,7 +201,7 @@ def _fixed_point(columns_rows: Floats) -> NDArray[np.int32]:
 
 
 def _beyond_near(polygon: list[list[float]], camera: SynthCamera) -> Floats:
-    """The part of a polygon beyond the near plane (Sutherland-Hodgman), (M, 2) as (column, row)."""
+    """Cut a polygon at the near plane (Sutherland-Hodgman): (M, 2) as (column, row)."""
     kept = []
     for start, end in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if start[2] >= NEAR_M:
@@ -214,7 +214,7 @@ def _beyond_near(polygon: list[list[float]], camera: SynthCamera) -> Floats:
 
 @dataclass(frozen=True)
 class Surface:
-    """Maps (H, W) of one frame.
+    """Holds maps (H, W) of one frame.
 
     Attributes:
         rays: (3, H, W) in camera coordinates; `world`: (3, H, W), metres.
@@ -242,7 +242,7 @@ class Surface:
 def surface_of(
     drawing: Drawing, facets: Facets, camera: SynthCamera, shadow: Floats, key: Key
 ) -> Surface:
-    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`."""
+    """Compute surface maps of one frame; `shadow` is (H, W) of `shadow_map`."""
     rays = camera.rays()
     inverse_depth = drawing.inverse_depth(rays)
     world = camera.to_world(rays, inverse_depth)
@@ -259,7 +259,7 @@ def surface_of(
 
 @lru_cache(maxsize=8)
 def noise_tile(seed: int) -> Floats:
-    """(256, 256) float32 periodic noise, stronger at low frequencies; zero mean, unit variance."""
+    """Make periodic noise (256, 256), stronger at low frequencies; mean 0, variance 1."""
     white = numpy_generator(seed, "synth/texture/tile").standard_normal((_TILE, _TILE))
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(_TILE), np.fft.fftfreq(_TILE))) * _TILE
     shaped = np.fft.ifft2(np.fft.fft2(white) / np.maximum(frequency, 3.0) ** 0.9).real
@@ -267,7 +267,7 @@ def noise_tile(seed: int) -> Floats:
 
 
 def sample_tile(seed: int, s: Floats, t: Floats) -> Floats:
-    """The tile at (s, t) in texels, repeated, bilinear."""
+    """Read the tile at (s, t) in texels, repeated, bilinear."""
     columns, rows = s - _TILE * np.floor(s / _TILE), t - _TILE * np.floor(t / _TILE)
     tile = noise_tile(seed)
     return np.asarray(cv2.remap(tile, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
@@ -276,7 +276,7 @@ def sample_tile(seed: int, s: Floats, t: Floats) -> Floats:
 def _texture(
     world: Floats, on_ground: NDArray[np.bool_], pixel_m: Floats, key: Key
 ) -> tuple[Floats, Floats]:
-    """Fine grain (5 cm) and coarse patches (40 cm) where pixels resolve them; patches alone."""
+    """Return fine grain (5 cm) with coarse patches (40 cm) where resolved, and patches alone."""
     seed, index = key
     offset = numpy_generator(seed, "synth/texture", index).random(4).astype(np.float32) * _TILE
     s = np.where(on_ground, world[0], world[0] + world[2])
@@ -296,7 +296,7 @@ def _windows(
     facets: Facets,
     camera: SynthCamera,
 ) -> tuple[Floats, Floats]:
-    """Cover of windows, smooth at their edges, and a number in 0..1 per window."""
+    """Return the cover of windows, smooth at their edges, and a number in 0..1 per window."""
     cover, lit = np.zeros(material.size, np.float32), np.ones(material.size, np.float32)
     flat, pixel_m = material.ravel(), pixel_HW.ravel()
     on_wall = np.flatnonzero((flat == _FACADES[0]) | (flat == _FACADES[1]))
@@ -316,7 +316,7 @@ def _windows(
 
 
 def _band(position: Floats, half: Floats | float, blur: Floats) -> Floats:
-    """1 within `half` of the middle of each unit cell, falling to 0 over `blur`."""
+    """Return 1 within `half` of the middle of each unit cell, falling to 0 over `blur`."""
     distance = np.abs(position - np.floor(position) - 0.5)
     return np.asarray(np.clip((half - distance) / np.maximum(blur, 0.02) + 0.5, 0, 1), np.float32)
 
@@ -324,7 +324,7 @@ def _band(position: Floats, half: Floats | float, blur: Floats) -> Floats:
 def shadow_map(
     placed: Sequence[Placed], camera: SynthCamera, light: Light, *, whole: bool = False
 ) -> Floats:
-    """(H, W) float32: how much of the light an object takes from each ground point, 0..1.
+    """Compute how much of the light an object takes from each ground point, (H, W) in 0..1.
 
     A dark spot below each object, and by day the shadow of its box along the sun's direction.
     `whole` also draws those of which a part lies behind the camera.
@@ -360,7 +360,7 @@ def shadow_map(
 
 
 def _footprints(casting: Sequence[Placed]) -> tuple[Floats, Floats, Floats]:
-    """Corners (M, 4, 2) of each object's base in (X, Z), its height, the start of its shadow."""
+    """Return corners (M, 4, 2) of bases in (X, Z), heights, and starts of shadows."""
     x, z, yaw, start = floats([(p.x, p.z, p.yaw, p.shadow_from) for p in casting]).T
     sizes = [(p.shape.half_width, p.shape.height, p.shape.half_length) for p in casting]
     scales = np.array([p.scale for p in casting])

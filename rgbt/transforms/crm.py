@@ -58,16 +58,16 @@ class CrmTransform:
 
     @property
     def dtype(self) -> type[np.uint8 | np.float32]:
-        """Type of the images of its examples."""
+        """Return the type of the images of its examples."""
         return np.uint8 if self.colour == "intended" else np.float32
 
     @property
     def record(self) -> TransformRecord:
-        """The size of its examples."""
+        """State the size of its examples."""
         return TransformRecord(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example."""
+        """Make an augmented example."""
         maps = Maps.of(sample)
         hw = maps.hw
         if self.sizes is not None:
@@ -84,12 +84,12 @@ class CrmTransform:
         return replace(example, rgb=rgb, thermal=thermal)
 
     def test(self, sample: Sample) -> Example:
-        """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
+        """Resize the whole image to `test_short_edge` where that is set; the label stays."""
         sizes, track = (self.test_short_edge, self.max_size), self.track_position
         return evaluated(sample, *sizes, track_position=track, dtype=self.dtype)
 
     def coloured(self, rgb: Image, thermal: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-        """RGB and thermal with changes drawn from `rng`."""
+        """Change RGB and thermal as drawn from `rng`."""
 
         def changed(image: Image, change: Callable[..., Image], low: float, high: float) -> Image:
             happens = rng.random() < self.colour_probability
@@ -110,7 +110,7 @@ class CrmTransform:
 
 
 def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -> NDArray[np.uint8]:
-    """``image * factor + offset``, clipped to 0..255 and truncated to whole numbers (uint8)."""
+    """Return ``image * factor + offset``, clipped to 0..255, truncated to whole numbers (uint8)."""
     if image.dtype == np.uint8:  # the same arithmetic, done once for each of the 256 values
         table = scale_and_truncate(LEVELS.astype(np.float32), factor, offset)
         return np.asarray(cv2.LUT(image, table), np.uint8)
@@ -119,17 +119,17 @@ def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -
 
 
 def scale_saturation(image: Image, factor: float) -> Image:
-    """HSV saturation times `factor`, truncated to whole numbers of OpenCV's unit."""
+    """Multiply HSV saturation by `factor`, truncated to whole numbers of OpenCV's unit."""
     return with_hsv(image, 1, lambda saturation: scale_and_truncate(saturation, factor))
 
 
 def shift_hue(image: Image, shift: int) -> Image:
-    """Hue, truncated to whole numbers of OpenCV's unit, plus `shift`, modulo 180."""
+    """Add `shift` to the hue, truncated to whole numbers of OpenCV's unit, modulo 180."""
     return with_hsv(image, 0, lambda hue: (hue.astype(np.int32) + shift) % 180)
 
 
 def with_hsv(image: Image, channel: int, change: Callable[[Image], Image]) -> Image:
-    """RGB with a channel of its HSV changed, in OpenCV's units for the dtype of `image`.
+    """Change a channel of the HSV of RGB, in OpenCV's units for the dtype of `image`.
 
     OpenCV 5 truncates in its vector code and rounds in what is left of a row of 8-bit pixels, so
     that a pixel would depend on the width of the image and on the processor. One long row of a

@@ -26,7 +26,7 @@ LUMA = np.array([0.2989, 0.587, 0.114], np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class FixedSize:
-    """What the transforms here share; `resizing` are options of `Maps.resize` in evaluation."""
+    """Resizes whole images for evaluation; `resizing` are further options of `Maps.resize`."""
 
     crop_hw: Size
     flip_probability: Share
@@ -36,11 +36,11 @@ class FixedSize:
 
     @property
     def record(self) -> TransformRecord:
-        """The size of its examples."""
+        """State the size of its examples."""
         return TransformRecord(crop_hw=self.crop_hw)
 
     def test(self, sample: Sample) -> Example:
-        """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
+        """Resize the whole image to `test_short_edge` where that is set; the label stays."""
         track = self.track_position
         return evaluated(sample, self.test_short_edge, track_position=track, **self.resizing)
 
@@ -60,7 +60,7 @@ class CmxTransform(FixedSize):
     padding_thermal: Annotated[tuple[GreyLevel, ...], Len(1, 3)]
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example; what is padding is 255 in its label."""
+        """Make an augmented example; padding is 255 in its label."""
         maps = Maps.of(sample).flip(rng.random() < self.flip_probability)
         factor = float(rng.choice(self.factors))
         hw = max(1, int(maps.hw[0] * factor)), max(1, int(maps.hw[1] * factor))
@@ -86,7 +86,7 @@ class CmnextTransform(FixedSize):
     scale_range: Rising[SizeFactor]
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example; what is padding is 0, and 255 in its label."""
+        """Make an augmented example; padding is 0, and 255 in its label."""
         rgb = sample.rgb
         if rng.random() < self.colour_probability:
             rgb = recoloured(rgb, *rng.uniform(*self.colour_range, size=3))
@@ -102,14 +102,14 @@ class CmnextTransform(FixedSize):
 
 
 def scaled_hw(hw: tuple[int, int], factor: float) -> tuple[int, int]:
-    """Both sides times a factor, rounded, at least one pixel."""
+    """Multiply both sides by a factor, rounded, at least one pixel."""
     return max(1, round(hw[0] * factor)), max(1, round(hw[1] * factor))
 
 
 def recoloured(
     image: NDArray[np.uint8], brightness: float, contrast: float, saturation: float
 ) -> NDArray[np.uint8]:
-    """Factors of brightness, contrast and saturation of (H, W, 3), one after the other.
+    """Change brightness, contrast and saturation of (H, W, 3), one after the other.
 
         mix(x, y, f) = f x + (1 - f) y, clipped to 0..255 and truncated
         a = mix(x, 0, brightness),  b = mix(a, mean luma of a, contrast)
@@ -143,7 +143,7 @@ class RtfnetTransform(FixedSize):
     cut_share: Annotated[float, Interval(ge=0, le=0.5)]
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example; the aspect is not kept."""
+        """Make an augmented example; the aspect is not kept."""
         maps = Maps.of(sample).flip(rng.random() < self.flip_probability)
         rows, columns = (draw_ends(length, self.cut_share, rng) for length in maps.hw)
         cut = maps.crop((rows, columns))
@@ -151,7 +151,7 @@ class RtfnetTransform(FixedSize):
 
 
 def draw_ends(length: int, share: float, rng: np.random.Generator) -> slice:
-    """What is left of one axis: at most n - 1 pixels are cut off at the start and n at the end.
+    """Draw what is left of one axis: at most n - 1 pixels are cut at the start, n at the end.
 
         n = floor(share * length)
         first in 0..n-1, end in length-n..length, uniform; all of it where n is 0
@@ -180,7 +180,7 @@ class ThesisTransform(FixedSize):
     resizing = {"area": True}
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example; the aspect is not kept, nothing is cut."""
+        """Make an augmented example; the aspect is not kept, nothing is cut."""
         flipped = rng.random() < self.flip_probability
         blurred = rng.random() < self.blur_probability
         maps = Maps.of(sample)
@@ -211,7 +211,7 @@ class SemsegTransform(FixedSize):
     resizing = {"dtype": np.float32}
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example of `crop_hw`."""
+        """Make an augmented example of `crop_hw`."""
         maps, fill = Maps.of(sample), (self.padding_rgb, self.padding_thermal, IGNORE, 0.0)
         height, width = hw = scaled_hw(maps.hw, float(rng.uniform(*self.scale_range)))
         maps = maps.resize(hw, dtype=np.float32)
@@ -271,12 +271,12 @@ class HeatNetTransform:
 
     @property
     def record(self) -> TransformRecord:
-        """The size of its examples; images of the target keep their blocks and thermal."""
+        """State the size of its examples; images of the target keep their blocks and thermal."""
         plain = replace(self, drop_probability=0.0, thermal_probability=0.0, class_probability=0.0)
         return TransformRecord(crop_hw=self.crop_hw, for_target=None if plain == self else plain)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example of `crop_hw`; no label: all pixels ignored."""
+        """Make an augmented example of `crop_hw`; no label: all pixels ignored."""
         (height, width), margin = self.crop_hw, self.side_margin
         room = (self.resize_hw[0], self.resize_hw[1] - 2 * margin)
         rows, columns = drawn_window(room, self.crop_hw, rng)
@@ -303,11 +303,11 @@ class HeatNetTransform:
         return replace(maps, thermal=thermal).example(False)
 
     def _without_block(self, maps: Maps, rng: np.random.Generator) -> Maps:
-        """One block of RGB or of thermal at the middle grey level."""
-        height, width = (
-            int(rng.integers(low, max(high, low + 1)))
-            for low, high in (self.drop_height, self.drop_width)
-        )
+        """Set one block of RGB or of thermal to the middle grey level."""
+        low, high = self.drop_height
+        height = int(rng.integers(low, max(high, low + 1)))
+        low, high = self.drop_width
+        width = int(rng.integers(low, max(high, low + 1)))
         window = drawn_window(self.crop_hw, (height, width), rng)
         name = "rgb" if rng.random() < 0.5 else "thermal"
         image = getattr(maps, name).copy()
@@ -315,7 +315,7 @@ class HeatNetTransform:
         return replace(maps, **{name: image})
 
     def test(self, sample: Sample) -> Example:
-        """The whole image at `resize_hw`; the label as it is."""
+        """Resize the whole image to `resize_hw`; the label stays as it is."""
         maps = Maps.of(sample)
         example = maps.resize(self.resize_hw, dtype=np.float32).example(False)
         return replace(example, label=maps.label, confidence=maps.confidence)

@@ -26,7 +26,7 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class Maps:
-    """The maps of one sample, as in `rgbt.types.Example`, but all of one size.
+    """Holds the maps of one sample, as in `rgbt.types.Example`, but all of one size.
 
     `rows` (H,) and `columns` (W,) are those of the file, whose size is `source_hw`.
     """
@@ -42,7 +42,7 @@ class Maps:
 
     @classmethod
     def of(cls, sample: Sample) -> Maps:
-        """The whole sample as it is in its files; all pixels ignored where it has no label."""
+        """Take the whole sample of its files; all pixels are ignored where it has no label."""
         height, width = hw = sample.thermal.shape
         label = np.full(hw, IGNORE, np.uint8) if sample.label is None else sample.label
         place = (np.arange(height), np.arange(width), (height, width))
@@ -50,11 +50,11 @@ class Maps:
 
     @property
     def hw(self) -> tuple[int, int]:
-        """Height and width."""
+        """Return height and width."""
         return len(self.rows), len(self.columns)
 
-    def each(self, change: Change) -> Maps:
-        """Every map changed by one function of it and of its number."""
+    def changed(self, change: Change) -> Maps:
+        """Change every map by one function of it and of its number."""
         return replace(
             self,
             rgb=change(self.rgb, 0),
@@ -64,16 +64,16 @@ class Maps:
         )
 
     def crop(self, window: Window) -> Maps:
-        """The part within `window`."""
+        """Return the part within `window`."""
         rows, columns = window
-        cropped = self.each(lambda each, _: each[window])
+        cropped = self.changed(lambda values, _: values[window])
         return replace(cropped, rows=self.rows[rows], columns=self.columns[columns])
 
     def flip(self, flipped: bool) -> Maps:
-        """All of it mirrored left to right, if `flipped`."""
+        """Mirror all of it left to right, if `flipped`."""
         if not flipped:
             return self
-        turned = self.each(lambda each, _: np.asarray(cv2.flip(each, 1)))
+        turned = self.changed(lambda values, _: np.asarray(cv2.flip(values, 1)))
         return replace(turned, columns=self.columns[::-1])
 
     def resize(
@@ -84,34 +84,35 @@ class Maps:
         dtype: DTypeLike = np.uint8,
         area: bool = False,
     ) -> Maps:
-        """Images bilinear with half-pixel centres and without antialiasing, the rest nearest.
+        """Resize images bilinear, with half-pixel centres, not antialiased; the rest nearest.
 
         Returned, and computed, is the part of all `hw` pixels within `window`. Images become
         `dtype`, uint8 (rounded) or float32. `area`: where no side grows, a pixel of an image is the
         mean of what it covers.
         """
         window = window or (slice(0, hw[0]), slice(0, hw[1]))
-        rows, columns = (_axis(*each) for each in zip(self.hw, hw, window, strict=True))
+        rows = _axis(self.hw[0], hw[0], window[0])
+        columns = _axis(self.hw[1], hw[1], window[1])
         # "Exact": whole-number arithmetic for uint8, so that block and whole image round alike and
         # every machine gives the same bits. For float32 it is the ordinary bilinear.
         shrinks = area and hw[0] <= self.hw[0] and hw[1] <= self.hw[1]
         how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR_EXACT
 
-        def resized(each: NDArray[Any], number: int) -> NDArray[Any]:
+        def resized(values: NDArray[Any], number: int) -> NDArray[Any]:
             if number > 1:
-                return each.take(rows.nearest, 0).take(columns.nearest, 1)
-            block = each[rows.source, columns.source].astype(dtype, copy=False)
+                return values.take(rows.nearest, 0).take(columns.nearest, 1)
+            block = values[rows.source, columns.source].astype(dtype, copy=False)
             if hw != self.hw:
                 block = cv2.resize(block, (columns.size, rows.size), interpolation=how)
             return np.asarray(block[rows.window, columns.window])
 
-        maps = self.each(resized)
+        maps = self.changed(resized)
         return replace(maps, rows=self.rows[rows.nearest], columns=self.columns[columns.nearest])
 
     def pad(
         self, hw: tuple[int, int], fill: Fill, corner_yx: tuple[int, int] | None = None
     ) -> Maps:
-        """All of it in a larger frame, from `corner_yx` on.
+        """Put all of it into a larger frame, from `corner_yx` on.
 
         None: in the middle; odd margins are larger below and right.
         """
@@ -120,45 +121,49 @@ class Maps:
         height, width = self.hw
         top, left = corner_yx or ((hw[0] - height) // 2, (hw[1] - width) // 2)
 
-        def framed(each: NDArray[Any], number: int) -> NDArray[Any]:
-            canvas = np.empty((*hw, *each.shape[2:]), each.dtype)
+        def framed(values: NDArray[Any], number: int) -> NDArray[Any]:
+            canvas = np.empty((*hw, *values.shape[2:]), values.dtype)
             canvas[:] = fill[number]
-            canvas[top : top + height, left : left + width] = each
+            canvas[top : top + height, left : left + width] = values
             return canvas
 
         return replace(
-            self.each(framed),
+            self.changed(framed),
             rows=np.pad(self.rows, (top, hw[0] - height - top), mode="edge"),
             columns=np.pad(self.columns, (left, hw[1] - width - left), mode="edge"),
         )
 
     def rotate(self, angle: float, middle_xy: tuple[float, float], fill: Fill) -> Maps:
-        """Rotated counter-clockwise about a point, by degrees; places are counted `around` anew."""
+        """Rotate counter-clockwise about a point, by degrees; places are counted `around` anew."""
         matrix = np.asarray(cv2.getRotationMatrix2D(middle_xy, angle, 1.0))
 
-        def warped(each: NDArray[Any], number: int) -> NDArray[Any]:
+        def warped(values: NDArray[Any], number: int) -> NDArray[Any]:
             how = cv2.INTER_LINEAR if number < 2 else cv2.INTER_NEAREST
             size, border = self.hw[::-1], cv2.BORDER_CONSTANT
-            return np.asarray(cv2.warpAffine(each, matrix, size, None, how, border, fill[number]))
+            return np.asarray(cv2.warpAffine(values, matrix, size, None, how, border, fill[number]))
 
         column, row = np.rint(matrix @ [*self.centre_yx[::-1], 1.0])
-        rotated = self.each(warped)
+        rotated = self.changed(warped)
         return rotated.around(int(row.clip(0, self.hw[0] - 1)), int(column.clip(0, self.hw[1] - 1)))
 
     def around(self, row: int, column: int) -> Maps:
-        """The same with places that are counted from the pixel that shows the file's centre."""
+        """Count places from the pixel that shows the file's centre."""
         height, width = self.source_hw
         rows, columns = (np.arange(side) for side in self.hw)
         return replace(self, rows=rows - row + height // 2, columns=columns - column + width // 2)
 
     def blur(self, kernel: int) -> Maps:
-        """Images blurred by OpenCV's Gaussian kernel of a side in pixels."""
+        """Blur images by OpenCV's Gaussian kernel of a side in pixels."""
         side = (kernel, kernel)
-        return self.each(lambda each, n: cv2.GaussianBlur(each, side, 0) if n < 2 else each)
+
+        def blurred(values: NDArray[Any], number: int) -> NDArray[Any]:
+            return np.asarray(cv2.GaussianBlur(values, side, 0)) if number < 2 else values
+
+        return self.changed(blurred)
 
     @property
     def centre_yx(self) -> tuple[int, int]:
-        """The pixel nearest to the centre of the file, the first in row-major order.
+        """Return the pixel nearest to the centre of the file, the first in row-major order.
 
         GRBM follows it through the crop, in the SpatialSeg release (MFNet data set). The squared
         distance is a row term plus a column term, so each is minimised alone.
@@ -168,12 +173,12 @@ class Maps:
         return int(row), int(np.abs(self.columns - width // 2).argmin())
 
     def example(self, track_position: bool) -> Example:
-        """The example; `track_position`: with the map of places in the file."""
+        """Make the example; `track_position`: with the map of places in the file."""
         position = None
         if track_position:
             position = np.empty((2, *self.hw), np.float32)
             position[0], position[1] = self.rows[:, None], self.columns
-        whole = self.each(lambda each, _: np.ascontiguousarray(each))
+        whole = self.changed(lambda values, _: np.ascontiguousarray(values))
         return Example(
             rgb=whole.rgb,
             thermal=whole.thermal,
@@ -194,7 +199,7 @@ def evaluated(
     track_position: bool,
     **how: Any,
 ) -> Example:
-    """Whole images, resized as `short_edge_hw` and `Maps.resize` say; the label as it is."""
+    """Resize whole images as `short_edge_hw` and `Maps.resize` say; the label stays as it is."""
     maps = Maps.of(sample)
     hw = maps.hw if short_edge is None else short_edge_hw(maps.hw, short_edge, max_size)
     example = maps.resize(hw, **how).example(track_position)
@@ -207,7 +212,7 @@ def drawn_window(
     rng: np.random.Generator,
     release: Literal["crm", "cmx", "cmnext"] = "crm",
 ) -> Window:
-    """A crop at a uniformly drawn place; a side longer than the image is clipped to it.
+    """Draw a crop at a uniform place; a side longer than the image is clipped to it.
 
     The first pixel of a side lies in 0..n, n = max(length - crop, 0), in the release of CRM. In
     that of CMX it may lie one too far, so that the crop lacks a pixel, and in that of CMNeXt also
@@ -227,7 +232,9 @@ def drawn_window(
 def short_edge_hw(
     source_hw: tuple[int, int], short_edge: int, max_size: int | None
 ) -> tuple[int, int]:
-    """Size of the same aspect, (floor(f H + 1/2), floor(f W + 1/2)). Source: CRM release.
+    """Return a size of the same aspect, (floor(f H + 1/2), floor(f W + 1/2)).
+
+    Source: CRM release.
 
     f = min(short_edge / min(H, W), max_size / max(H, W))
     """
@@ -239,32 +246,34 @@ def short_edge_hw(
 
 
 def nearest_source(source: int, resized: int) -> Indices:
-    """(resized,) int64: floor(i * source / resized) in float32, as torch's "nearest" picks it."""
+    """Return floor(i * source / resized) in float32, (resized,), as torch's "nearest" picks it."""
     factor = np.float32(source) / np.float32(resized)
     index = np.floor(np.arange(resized, dtype=np.float32) * factor).astype(np.int64)
     return np.asarray(np.minimum(index, source - 1))
 
 
 def nearest(label: NDArray[Any], hw: tuple[int, int]) -> NDArray[Any]:
-    """A label (H, W) at another size, nearest as `nearest_source`."""
-    rows, columns = (nearest_source(*each) for each in zip(label.shape, hw, strict=True))
+    """Resize a label (H, W), nearest as `nearest_source`."""
+    rows, columns = nearest_source(label.shape[0], hw[0]), nearest_source(label.shape[1], hw[1])
     return label.take(rows, 0).take(columns, 1)
 
 
 def bilinear(image: NDArray[Any], hw: tuple[int, int]) -> NDArray[Any]:
-    """An image (H, W) at another size, as `Maps.resize`."""
+    """Resize an image (H, W) as `Maps.resize`."""
     return np.asarray(cv2.resize(image, hw[::-1], interpolation=cv2.INTER_LINEAR_EXACT))
 
 
 def mixed(label: NDArray[np.uint8], hw: tuple[int, int]) -> NDArray[np.uint8]:
-    """A label (H, W) resized as if it were brightness; a mix with an ignored pixel is ignored."""
+    """Resize a label (H, W) as if it were brightness; a mix with an ignored pixel is ignored."""
     touched = bilinear((label == IGNORE).astype(np.float32), hw) > 0
     return np.where(touched, np.uint8(IGNORE), bilinear(label, hw))
 
 
 class _Axis(NamedTuple):
-    """What of an axis is resized alone: pixels of the source, their number after it, and the part
-    that is kept of these; `nearest` are its pixels of the source without interpolation.
+    """Says what of an axis is resized alone.
+
+    `source` are pixels of the source, `size` is their number after resizing, `window` the part of
+    these that is kept; `nearest` are the pixels of the source without interpolation.
     """
 
     source: slice
@@ -274,7 +283,7 @@ class _Axis(NamedTuple):
 
 
 def _axis(source: int, resized: int, kept: slice) -> _Axis:
-    """The smallest block around `kept` whose resizing gives the pixels of the whole axis.
+    """Find the smallest block around `kept` whose resizing gives the pixels of the whole axis.
 
     With source : resized = p : q in lowest terms, resized pixel k q + i samples at p k plus the
     place of pixel i. So whole periods may be resized alone, with one more on either side for the

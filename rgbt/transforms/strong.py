@@ -25,7 +25,7 @@ THERMAL_SETTINGS = ("thermal_brightness", "thermal_contrast")
 
 @dataclass(frozen=True, kw_only=True)
 class StrongAugmentation:
-    """Colour jitter of RGB, its brightness and contrast for thermal, and Gaussian blur of both.
+    """Jitters colours of RGB, brightness and contrast of thermal, and blurs both.
 
     With strength s, draws u of U(-s, s) and values clipped to [0, 1] after every change:
 
@@ -48,7 +48,7 @@ class StrongAugmentation:
     def __call__(
         self, rgb: Tensor, thermal: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Changed images: (B, 3, H, W) and (B, 1, H, W) float32 in [0, 1], as they were.
+        """Change images (B, 3, H, W) and (B, 1, H, W) float32 in [0, 1], and return them.
 
         `generator` is of any device; the number of draws is always the same.
         """
@@ -61,8 +61,8 @@ class StrongAugmentation:
         whole = torch.rand(2 + len(CHANGES), generator=generator, device=device)
         *changes, blur = own_draw(draw, len(rgb)).unbind(1)
         by = {
-            name: (self.jitter_strength * (2 * each - 1)).view(-1, 1, 1, 1)
-            for name, each in zip(names, changes, strict=True)
+            name: (self.jitter_strength * (2 * uniform - 1)).view(-1, 1, 1, 1)
+            for name, uniform in zip(names, changes, strict=True)
         }
         jitters, blurs, *order = whole.tolist()
         if jitters < self.jitter_probability:
@@ -73,12 +73,12 @@ class StrongAugmentation:
         if blurs < self.blur_probability:
             low, high = self.blur_sigma
             sigma = low + (high - low) * blur
-            rgb, thermal = (blurred(each, sigma, high) for each in (rgb, thermal))
+            rgb, thermal = blurred(rgb, sigma, high), blurred(thermal, sigma, high)
         return rgb, thermal
 
 
 def jittered(images: Tensor, change: str, by: Tensor) -> Tensor:
-    """One of `CHANGES` of images (B, C, H, W) in [0, 1] by (B, 1, 1, 1), see the class."""
+    """Make one of `CHANGES` to images (B, C, H, W) in [0, 1] by (B, 1, 1, 1), see the class."""
     if change == "brightness":
         return (images + by).clamp(0, 1)
     if change == "contrast":
@@ -97,7 +97,7 @@ def jittered(images: Tensor, change: str, by: Tensor) -> Tensor:
 
 
 def blurred(images: Tensor, sigma: Tensor, largest: float) -> Tensor:
-    """Images (B, C, H, W) after Gaussian blur with sigma (B,), at most `largest`, in pixels.
+    """Blur images (B, C, H, W) by Gaussians of sigma (B,), at most `largest`, in pixels.
 
     The kernel ends at 4 `largest`; beyond the border, the pixels of the border are repeated.
     """

@@ -81,7 +81,7 @@ class VirtualView:
         return Record(requires=requires)
 
     def check(self, angles: Tensor, least: float = 0.0) -> None:
-        """InputError where angles (B, 3) leave no more than a share of the camera's own images."""
+        """Refuse (InputError) angles (B, 3) that leave at most a share of the camera's images."""
         size = (self.camera.height, self.camera.width)
         turn = homography(angles, self.camera.matrix(size), self.order)
         left, top, right, bottom = inner_rectangle(turn, size, self.rectangle).unbind(1)
@@ -94,7 +94,7 @@ class VirtualView:
             )
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, 3) float64: yaw, pitch, roll in degrees, on the device of `generator`."""
+        """Draw yaw, pitch, roll in degrees, (count, 3) float64, on the device of `generator`."""
         device = generator.device
         ranges = torch.tensor(list(self.ranges.values()), dtype=torch.float64, device=device)
         low, high = ranges.unbind(1)
@@ -103,7 +103,7 @@ class VirtualView:
         return angles.floor() if self.angles == "integer" else angles
 
     def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
-        """Where the pixels of the view by `angles` (B, 3) come from; errors as `Camera.matrix`."""
+        """Say where pixels of the view by `angles` (B, 3) come from; errors as `Camera.matrix`."""
         turn = homography(angles, self.camera.matrix(image_hw), self.order)
         if self.mode == "rotation":
             height, width = image_hw
@@ -116,7 +116,7 @@ class VirtualView:
         return Warp(turn, rectangle, image_hw, self.resampling)
 
     def batch(self, batch: Batch, warp: Warp) -> Batch:
-        """The frames as seen from the view: images bilinear, the other maps nearest.
+        """Warp the frames to the view: images bilinear, the other maps nearest.
 
         Images are float in [0, 1] and have the size of `warp`; the label may have another one, as
         in evaluation. What the first frame does not show has the confidence 1 where it is trained
@@ -141,13 +141,13 @@ class VirtualView:
         )
 
     def valid(self, warp: Warp) -> Tensor:
-        """(B, H, W) bool: pixels that losses count."""
+        """Return the pixels that losses count, (B, H, W) bool."""
         inside = warp.inside()
         return inside if self.outside_label == IGNORE else torch.ones_like(inside)
 
 
 class ViewSets:
-    """The virtual views and splits on which consistency (TC and CA) is measured.
+    """Holds the virtual views and splits on which consistency (TC and CA) is measured.
 
     Source: Temporal, Table I: the mean over three sets of angles, those of its release. The k-th
     triple belongs to the k-th image of the split's list; longer lists begin again with the first.
@@ -181,28 +181,29 @@ class ViewSets:
 
     @property
     def record(self) -> Record:
-        """What its views require of the data set."""
+        """State what its views require of the data set."""
         requires = record_of(self.view, Record).requires if self.sets else ()
-        return Record(requires=tuple(each.inside("consistency") for each in requires))
+        return Record(requires=tuple(need.inside("consistency") for need in requires))
 
     @cached_property
     def mark(self) -> str:
-        """Part of file names: "" for the published views, six digits for other triples or views."""
+        """Return a part of file names: "" for the published views, six digits for others."""
         names = ("order", "mode", "rectangle", "resampling")
         settings = {name: getattr(self.view, name) for name in names}
         settings |= {"camera": asdict(self.view.camera), "outside": self.view.outside_label}
-        text = json.dumps([settings, [each.tolist() for each in self._triples]], sort_keys=True)
+        triples = [triples.tolist() for triples in self._triples]
+        text = json.dumps([settings, triples], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:6]
         return "" if digest == PUBLISHED_VIEWS else digest
 
     def angles(self, number: int, indices: list[int]) -> Tensor:
-        """(B, 3) float64 degrees: triples of set `number` (0-based) at places in a split's list."""
+        """Return triples of set `number` (0-based) at places in a split's list, (B, 3) degrees."""
         triples = self._triples[number]
         return triples[torch.tensor(indices) % len(triples)]
 
 
 def read_angles(name: str) -> Tensor:
-    """(N, 3) float64: the triples of a published set, or of a file; InputError for no triples."""
+    """Read the triples (N, 3) float64 of a published set, or of a file; InputError for none."""
     published = {path.stem: path for path in PUBLISHED.glob("*.csv")}
     path = published.get(name, Path(name).expanduser())
     if not path.is_file():

@@ -50,8 +50,8 @@ MAKE: dict[str, Callable[[Any], Corruption]] = {
 def test_the_image_that_is_named_fails_alone(name: str) -> None:
     """Of both at once each fails as it does alone; the source, which is read-only, stays."""
     found, source = {}, sample()
-    for each in (source.rgb, source.thermal):  # as of a map of decoded frames
-        each.setflags(write=False)
+    for image in (source.rgb, source.thermal):  # as of a map of decoded frames
+        image.setflags(write=False)
     for image in ("rgb", "thermal", "both"):
         kind = MAKE[name](image)
         found[image] = changed = kind(source, kind.severities[0], rng_of())

@@ -47,11 +47,11 @@ def test_samples_are_decoded_once_and_equal(
     expected = [source.read(name) for name in NAMES]
     monkeypatch.setattr(MFNet, "read", None)
     # As a worker process gets it, and another command.
-    for each in (cached, pickle.loads(pickle.dumps(cached))):
+    for dataset in (cached, pickle.loads(pickle.dumps(cached))):
         cache.opened.cache_clear()
         for sample in expected * 2:
-            assert_equal(each.read(sample.name), sample)
-            np.testing.assert_array_equal(each.label(sample.name), sample.label)
+            assert_equal(dataset.read(sample.name), sample)
+            np.testing.assert_array_equal(dataset.label(sample.name), sample.label)
     view = cached.read(NAMES[0])
     for image in (view.rgb, view.thermal, view.label):
         assert image.flags.c_contiguous

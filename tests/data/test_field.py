@@ -41,8 +41,8 @@ def write_pair(rgb: Path, thermal: Path, label: Path, value: int) -> None:
 def test_both_protocols_of_fmb(tmp_path: Path) -> None:
     for part, number in (("train", 14), ("train", 0), ("test", 3)):
         places = [
-            tmp_path / part / each / f"{number:05d}.png"
-            for each in ("Visible", "Infrared", "Label")
+            tmp_path / part / folder / f"{number:05d}.png"
+            for folder in ("Visible", "Infrared", "Label")
         ]
         write_pair(*places, number)
     with_background, without = opened("fmb", tmp_path), opened("fmb_14", tmp_path)
@@ -50,21 +50,15 @@ def test_both_protocols_of_fmb(tmp_path: Path) -> None:
     assert with_background.names("val") == with_background.names("test") == ("test_00003",)
     assert (with_background.classes[14], without.classes[13]) == ("pole", "pole")
     assert with_background.palette[14] == without.palette[13] == (90, 113, 135)
-    found = {name: each.label(f"train_{name}").flat[0] for name in ("00014", "00000")
-             for each in (without,)}  # fmt: skip
+    found = {name: without.label(f"train_{name}").flat[0] for name in ("00014", "00000")}
     assert found == {"00014": 13, "00000": 255}
     assert with_background.label("train_00000").flat[0] == 0
 
 
 def test_lists_and_layout_of_semanticrt(tmp_path: Path) -> None:
     for number in range(3):
-        write_pair(
-            *(
-                tmp_path / each
-                for each in (f"rgb/{number}.jpg", f"thermal/{number}.jpg", f"labels/{number}.png")
-            ),
-            number,
-        )
+        files = (f"rgb/{number}.jpg", f"thermal/{number}.jpg", f"labels/{number}.png")
+        write_pair(*(tmp_path / file for file in files), number)
     for number, split in enumerate(("train", "val", "test")):
         (tmp_path / f"{split}.txt").write_text(f"{number}\n")
     data = opened("semanticrt", tmp_path)
@@ -102,7 +96,7 @@ def test_lines_of_cart_name_image_and_label(tmp_path: Path) -> None:
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real pairs")
 def test_real_pairs_of_msrs(tmp_path: Path) -> None:
     lists = (f"test_{time}.txt" for time in ("day", "night"))
-    for name in ((REAL / each).read_text().split()[0] for each in lists):
+    for name in ((REAL / path).read_text().split()[0] for path in lists):
         packed = cv2.imread(str(REAL / "images" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         label = cv2.imread(str(REAL / "labels" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         for part in ("train", "test"):

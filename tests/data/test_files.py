@@ -250,7 +250,7 @@ def test_images_are_read_upright(
     side = 16 if kind == "jpg" else 1  # a block of JPEG keeps its grey level
 
     def image_of(rows: Sequence[str]) -> np.ndarray:
-        plane = np.array([[level[each] for each in row] for row in rows]).astype(depth[-2:])
+        plane = np.array([[level[letter] for letter in row] for row in rows]).astype(depth[-2:])
         plane = plane.repeat(side, 0).repeat(side, 1)
         return np.dstack([plane] * 3) if depth == "3u1" else plane
 

@@ -14,7 +14,7 @@ from rgbt.config.component import build
 from rgbt.data.check import check_dataset
 from rgbt.data.folder import draw_shares
 from rgbt.data.images import grey
-from rgbt.data.patterns import Frame, Pattern, in_order
+from rgbt.data.patterns import FrameFiles, Pattern, in_order
 from tests.conftest import write_png
 from tests.data.layouts import (
     CLASSES,
@@ -289,7 +289,7 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     assert "dataset.lists.train: none of the 2 lines of list.txt is a frame." in said
 
 
-def frames_of(*paths: str) -> dict[str, Frame]:
+def frames_of(*paths: str) -> dict[str, FrameFiles]:
     """Frames of {sequence}/{name}, or {camera}/{sequence}/{name}; nothing is on the disk."""
     words = ("camera", "sequence", "name")
     frames = {}
@@ -297,11 +297,11 @@ def frames_of(*paths: str) -> dict[str, Frame]:
         pieces = path.split("/")
         values = dict(zip(words[-len(pieces) :], pieces, strict=True))
         name = "_".join(pieces)
-        frames[name] = Frame(name, values, Path(path), Path(path), None)
+        frames[name] = FrameFiles(name, values, Path(path), Path(path), None)
     return frames
 
 
-def drawn(frames: dict[str, Frame], **keys: Any) -> dict[str, tuple[str, ...]]:
+def drawn(frames: dict[str, FrameFiles], **keys: Any) -> dict[str, tuple[str, ...]]:
     shares = {"train": 0.5, "val": 0.25, "test": 0.25}
     return draw_shares(frames, **{"shares": shares, "seed": 0, "block": None, **keys})
 

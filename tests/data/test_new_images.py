@@ -128,10 +128,10 @@ def test_new_images_are_read_like_training_images(tmp_path: Path) -> None:
     expected = folder(tmp_path / "known").read("sea_1")
     files = (new / "sea/rgb/1.png", new / "sea/ir/1_ir.tif")
     (alone,) = of_files(dataset, *files).samples("raise")
-    for each in (sample, alone):
-        assert each.label is None
-        assert np.array_equal(each.thermal, expected.thermal)
-        assert np.array_equal(each.rgb, expected.rgb)
+    for found in (sample, alone):
+        assert found.label is None
+        assert np.array_equal(found.thermal, expected.thermal)
+        assert np.array_equal(found.rgb, expected.rgb)
     assert (sample.name, alone.name) == ("sea_1", "1")
 
 

@@ -90,10 +90,12 @@ def test_a_frame_without_its_partner_is_reported(mvseg: Path, gone: str) -> None
     path = mvseg / "data" / "d" / gone
     path.unlink()
     kind = "RGB" if "visible" in gone else "thermal"
-    found = [each for each in MVSeg(str(mvseg)).own_problems({}) if f"no {kind} image" in each]
+    found = [
+        problem for problem in MVSeg(str(mvseg)).own_problems({}) if f"no {kind} image" in problem
+    ]
     # Without its RGB image, the thermal image and the label are left over.
     assert len(found) == (2 if kind == "RGB" else 1)
-    assert all(path.stem[:-1] in each for each in found)
+    assert all(path.stem[:-1] in problem for problem in found)
     assert MVSeg(str(mvseg)).sequences("test")
     dataset = MVSeg(str(mvseg), gaps="refuse")
     assert dataset.sequences("train")

@@ -123,7 +123,7 @@ def shown(edges: np.ndarray, h: np.ndarray, slack: float = 0.0) -> np.ndarray:
     back = np.einsum("ij,jnk->ink", np.linalg.inv(h), corners)
     last = np.array([HW[1], HW[0]])[:, None, None] - 0.5 + slack
     places = [corners[:2], back[:2] / back[2]]
-    inside = [(each >= -0.5 - slack).all((0, 2)) & (each <= last).all((0, 2)) for each in places]
+    inside = [(place >= -0.5 - slack).all((0, 2)) & (place <= last).all((0, 2)) for place in places]
     return inside[0] & inside[1] & (back[2] > 0).all(1) & (edges[:, :2] < edges[:, 2:]).all(1)
 
 
@@ -140,6 +140,6 @@ def test_no_rectangle_nearby_is_larger() -> None:
 
 @pytest.mark.parametrize("rule", ["largest", "corners"])
 def test_views_of_something_else_have_none(rule: Rule) -> None:
-    others = [view(*each) for each in ((80, 0, 0), (60, 60, 0), (180, 0, 0), (0, -90, 3))]
+    others = [view(*angles) for angles in ((80, 0, 0), (60, 60, 0), (180, 0, 0), (0, -90, 3))]
     found = inner_rectangle(torch.cat([view(1, 2, 3), *others]), HW, rule)
     assert found.isnan().all(1).tolist() == [False, True, True, True, True]

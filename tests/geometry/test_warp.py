@@ -113,7 +113,7 @@ def test_bilinear_is_the_slow_one_and_has_its_gradient(resampling: Resampling) -
 
 def test_once_repeats_the_border_and_twice_fades_it_out() -> None:
     ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
-    once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)
+    once, twice = (Warp(right, whole((4, 6)), (4, 6), resampling) for resampling in RESAMPLINGS)
     # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
     assert once.bilinear(ones)[0, 0, 0].tolist() == [1, 1, 1, 1, 1, 1]
     assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
@@ -205,8 +205,8 @@ def test_half_pixels_cover_what_exists_of_two_by_two(hw: tuple[int, int]) -> Non
         same = (classes == classes[:, :1]).all(-1)
         assert torch.equal(agreed[:, row, column], classes[:, 0].where(same, 255))
     exact = random_values(2, 3, *hw, dtype=torch.float64)
-    for each in (exact, exact.to(memory_format=torch.channels_last)):
-        assert torch.autograd.gradcheck(halved_mean, (each.clone().requires_grad_(),))
+    for values in (exact, exact.to(memory_format=torch.channels_last)):
+        assert torch.autograd.gradcheck(halved_mean, (values.clone().requires_grad_(),))
 
 
 @pytest.mark.parametrize("hw", [HW, (45, 60), (44, 61), (45, 61)])

@@ -66,7 +66,7 @@ LABEL = [[1, 1, 1, 255], [1, 1, 255, 255]]
 )
 def test_hard_pixels_by_hand(threshold: float, min_share: float, expected: list[float]) -> None:
     loss = OhemCrossEntropy(threshold=threshold, min_share=min_share, class_weights=None)
-    costs = [-log(each) for each in expected]
+    costs = [-log(share) for share in expected]
     assert part_of(loss, EASY, LABEL, "ohem") == pytest.approx(sum(costs) / len(costs), rel=1e-5)
     assert loss.record.weighs_confidence is False
 
@@ -103,7 +103,7 @@ def test_lovasz_by_hand() -> None:
     label = [[0, 0, 1, 255], [0, 0, 0, 0]]
     value = part_of(loss, logits, label, "lovasz")
     assert value == pytest.approx((sum(first) / 2 + 0.0001) / 2, rel=1e-4)
-    costs = [-log(each) for each in (0.8, 0.6, 0.7, *[0.9999] * 4)]
+    costs = [-log(share) for share in (0.8, 0.6, 0.7, *[0.9999] * 4)]
     assert part_of(loss, logits, label, "cross_entropy") == pytest.approx(0.5 * sum(costs) / 7)
 
 
@@ -118,7 +118,7 @@ def test_lovasz_by_hand() -> None:
 def test_nothing_labelled_costs_nothing_and_gradients_are_finite(loss: Any) -> None:
     logits = torch.tensor([[[[90.0, 0.0]], [[-90.0, 0.0]]]]).requires_grad_()
     parts = loss(Output(logits, {}), batch_of(torch.full((1, 1, 2), 255)), NOTHING)
-    assert [float(each) for each in parts.values()] == [0.0] * len(parts)
+    assert [float(part) for part in parts.values()] == [0.0] * len(parts)
     parts = loss(Output(logits, {}), batch_of(torch.tensor([[[0, 1]]])), NOTHING)
     torch.cat([*parts.values()]).sum().backward()
     assert logits.grad is not None

@@ -218,7 +218,7 @@ def test_large_scores_give_finite_values_and_gradients(dtype: torch.dtype) -> No
 def test_guidance_by_hand() -> None:
     main = [(0.96, 0.04), (0.5, 0.5), (0.6, 0.4), (0.95, 0.05), (0.03, 0.97)]
     other = [(0.60, 0.40), (0.01, 0.99), (0.7, 0.3), (0.95, 0.05), (0.98, 0.02)]
-    found = guidance(*(torch.tensor(each).T[None, :, None] for each in (main, other)), 0.95)
+    found = guidance(*(torch.tensor(shares).T[None, :, None] for shares in (main, other)), 0.95)
     # Sure p; sure q; nobody; not above the threshold; both, and the mean is (0.505, 0.495).
     assert found.tolist() == [[[0, 1, 255, 255, 0]]]
     assert found.dtype == torch.int64
@@ -257,7 +257,7 @@ def scores() -> Tensor:
 
 def test_classes_and_share_of_confident_pixels() -> None:
     found = pseudo_labels(scores().requires_grad_(), 0.8, "batch", (0.0, 0.0))
-    assert not any(each.requires_grad for each in found)
+    assert not any(labels.requires_grad for labels in found)
     assert found.label.tolist() == [[[0, 1], [1, 0]], [[0, 0], [0, 0]]]
     # 0.9 and 0.8 of the first image, 0.9 of the second: 3 of 8 pixels.
     assert found.confident.item() == 3 / 8

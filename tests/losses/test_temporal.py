@@ -156,7 +156,7 @@ def test_nothing_to_compare_has_no_gradient(
     found = OVERLAPS[name](*both, torch.full((2, 2, 2), label), form)
     assert found == expected
     gradients = torch.autograd.grad(found, (first, second), allow_unused=True)
-    assert not any(each is not None and each.any() for each in gradients)
+    assert not any(gradient is not None and gradient.any() for gradient in gradients)
 
 
 # ---- two frames ----

@@ -40,7 +40,7 @@ DROPS = {"dropout", "drop_path_rate", "decoder_dropout"}
 def drawn(net: Any, *given: Any, seed: int = 0, **options: Any) -> list[Tensor]:
     """All tensors that a network returns, logits first."""
     out = net(*given, generator=generator(seed), **options)
-    return [each for each in (out.logits, *out.aux.values()) if each is not None]
+    return [tensor for tensor in (out.logits, *out.aux.values()) if tensor is not None]
 
 
 @pytest.mark.parametrize("size", [(64, 96), (61, 83)])

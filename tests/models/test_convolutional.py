@@ -61,7 +61,7 @@ def test_every_thermal_image_is_divided_by_its_own_maximum() -> None:
     rgb, thermal = ones(count=3)
     thermal[0, 0, 0, 0], thermal[1], thermal[2] = 0.25, 0.125, 0.0
     _, scaled = inputs(thermal_scale="image_max")(rgb, thermal)
-    assert [each.unique().tolist() for each in scaled] == [[0.5, 1.0], [1.0], [0.0]]
+    assert [factor.unique().tolist() for factor in scaled] == [[0.5, 1.0], [1.0], [0.0]]
 
 
 def test_padding_and_hidden_pixels_are_the_mean() -> None:
@@ -280,7 +280,7 @@ def test_first_head_and_rgb_are_the_defaults() -> None:
 def test_statistics_move_where_norms_are_not_trained() -> None:
     net = nano("deeplabv2", train_norm="statistics", **MODIFIED)
     frozen = {name for name, p in net.named_parameters() if not p.requires_grad}
-    norms = {name for name, each in net.named_modules() if isinstance(each, nn.BatchNorm2d)}
+    norms = {name for name, module in net.named_modules() if isinstance(module, nn.BatchNorm2d)}
     own = [name for name in norms if name.startswith("backbone.")]
     assert frozen == {f"{name}.{part}" for name in own for part in ("weight", "bias")}
     assert len(own) < len(norms)

@@ -17,7 +17,7 @@ from rgbt.models.dinov2.encoder import (
     LoraProjection,
     resized_positions,
 )
-from rgbt.models.dinov2.model import Level
+from rgbt.models.dinov2.model import pyramid_level
 from rgbt.types import VIEWS
 from tests.models import plain
 from tests.models.golden import network
@@ -116,7 +116,7 @@ def second(
             query, key = q[:, head], k[:, head]
             if positions is None:
                 periods = state["rope_embed.periods"]
-                query, key = (turned(each, hw, first, periods) for each in (query, key))
+                query, key = (turned(part, hw, first, periods) for part in (query, key))
             parts.append((query @ key.T / len(head) ** 0.5).softmax(1) @ v[:, head])
         x = x + state[f"{at}.ls1.gamma"] * linear(f"{at}.attn.proj", torch.cat(parts, 1))
         y = normed(f"{at}.norm2", x)
@@ -321,7 +321,7 @@ def test_a_patch_covers_token_px_pixels(patch: int, token_px: int, hw: tuple[int
 @torch.no_grad()
 def test_levels_equal_a_second_computation() -> None:
     x = normal(1, 4, 2, 3)
-    finer = Level(4, token_px=8, stride=4)
+    finer = pyramid_level(4, token_px=8, stride=4)
     weight, bias = finer[0].weight, finer[0].bias  # (in, out, 2, 2), without overlap
     expected = torch.zeros(1, 2, 4, 6)
     for row in range(4):
@@ -329,7 +329,7 @@ def test_levels_equal_a_second_computation() -> None:
             pixel = x[0, :, row // 2, column // 2] @ weight[:, :, row % 2, column % 2] + bias
             expected[0, :, row, column] = F.layer_norm(pixel, (2,))
     torch.testing.assert_close(finer(x), expected)
-    coarser = Level(4, token_px=8, stride=16)
+    coarser = pyramid_level(4, token_px=8, stride=16)
     highest = x[..., :2, :2].amax((2, 3))
     torch.testing.assert_close(coarser(x[..., :2, :2])[..., 0, 0], F.layer_norm(highest, (4,)))
 

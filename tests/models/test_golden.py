@@ -57,7 +57,7 @@ def modules_of_crm() -> dict[str, str]:
         "pixel_decoder.adapter_1": f"{head}.adapter_1",
     }
     for name, branch, block in (("rgb", "RGB", 0), ("thermal", "THR", 1)):
-        paths[f"{name}.patch_embed"] = f"backbone.{branch}_branch.patch_embed"
+        paths[f"{name}.patch_embed"] = f"backbone.{branch}_branch.patch_embed.norm"
         for stage in range(4):
             at = f"backbone.{branch}_branch.layers.{stage}.blocks.{block}"
             paths[f"{name}.stage{stage}.block{block}"] = at
@@ -160,8 +160,10 @@ def arranged_as_cmx(name: str, output: Any) -> Tensors:
         both = zip(STREAMS, output, strict=True)
         maps = name.startswith("frm")
         return {f"{name}.{s}": x.permute(0, 3, 1, 2) if maps else x for s, x in both}
-    if name.endswith("_weights"):
-        return {name: output.permute(0, 1, 4, 2, 3)}
+    if name.endswith("channel_weights"):
+        return {name: output.view(len(output), 2, -1, 1, 1).transpose(0, 1)}
+    if name.endswith("spatial_weights"):
+        return {name: output.permute(3, 0, 1, 2)[:, :, None]}
     if name.startswith("ffm"):
         return {name: output.permute(0, 3, 1, 2)}
     return {name: output if name.startswith("decoder") else output.flatten(1, 2)}

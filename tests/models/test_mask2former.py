@@ -16,7 +16,7 @@ from rgbt.models.mask2former.head import (
     shrink,
     sine_code,
 )
-from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
+from rgbt.models.mask2former.network import Fusion, semantic_logits
 from rgbt.models.swin import PatchMerging, relative_index, shift_mask
 from rgbt.types import VIEWS, MaskPair
 from tests.models import plain
@@ -58,7 +58,7 @@ def test_fusion_by_hand(fusion: Any, order: tuple[int, ...]) -> None:
     rgb, thermal = torch.tensor([1.0, 3.0, 0.0]), torch.tensor([2.0, 2.0, 4.0])
     maps = {"rgb": [rgb.view(1, 1, 1, 3)] * 4, "thermal": [thermal.view(1, 1, 1, 3)] * 4}
     fused = torch.tensor(order) * 1.5**0.5
-    for level in layer(maps, Request(VIEWS, 1, 3)):
+    for level in layer(maps, VIEWS, 1, 3):
         expected = torch.stack([fused, rgb, thermal]).view(3, 1, 1, 3)
         torch.testing.assert_close(level, expected, rtol=0, atol=1e-4)
 
@@ -111,7 +111,7 @@ def test_mask_token_replaces_exactly_the_hidden_tokens() -> None:
     seen: dict[str, Tensor] = {}
     for name in ("RGB_branch", "THR_branch"):
         branch = net.backbone.get_submodule(name)
-        branch.patch_embed.register_forward_hook(
+        branch.patch_embed["norm"].register_forward_hook(
             lambda _m, _i, out, name=name: seen.update({f"{name}.embed": out})
         )
         branch.layers[0].register_forward_pre_hook(

@@ -97,30 +97,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(params=EMBEDDED)
-def each(request: pytest.FixtureRequest) -> Embedded:
+def embedded(request: pytest.FixtureRequest) -> Embedded:
     return EMBEDDED[request.param]
 
 
 # ---- what they share ------------------------------------------------------------------------
 
 
-def test_ordinary_reader_reads_the_scenes(each: Embedded, folder: Path) -> None:
-    data, shots = each.made(folder), shots_of(each.layout, each.plan)
-    plain = each.reader(str(data.root))
-    assert (data.name, data.background) == (each.plan.name, each.background)
+def test_ordinary_reader_reads_the_scenes(embedded: Embedded, folder: Path) -> None:
+    data, shots = embedded.made(folder), shots_of(embedded.layout, embedded.plan)
+    plain = embedded.reader(str(data.root))
+    assert (data.name, data.background) == (embedded.plan.name, embedded.background)
     assert plain.fingerprint() == data.fingerprint()
-    assert {split: len(plain.names(split)) for split in each.plan.numbers} == each.plan.numbers
-    assert [shot.scene for shot in shots] == list(range(sum(each.plan.numbers.values())))
-    names = [name for split in each.plan.numbers for name in data.names(split)]
+    assert {
+        split: len(plain.names(split)) for split in embedded.plan.numbers
+    } == embedded.plan.numbers
+    assert [shot.scene for shot in shots] == list(range(sum(embedded.plan.numbers.values())))
+    names = [name for split in embedded.plan.numbers for name in data.names(split)]
     for shot in shots[::4]:
         scene = render_scene(
-            0, shot.scene, replace(each.plan.factors, night_share=float(shot.night))
+            0, shot.scene, replace(embedded.plan.factors, night_share=float(shot.night))
         )
         name = sorted(names, key=lambda name: shot.name not in name)[0]
         sample, (rgb, thermal) = data.read(name), (scene.rgb, scene.thermal)
         assert np.array_equal(plain.read(name).rgb, sample.rgb)
         assert (sample.label is None) == (shot.split == "train_night")
-        if each.plan.name == "synth_freiburg":
+        if embedded.plan.name == "synth_freiburg":
             assert np.array_equal(sample.rgb, rgb[1:97, 48:240])
             # Counts become the grey levels of `synth`, but for rounding to counts first.
             seen, thermal = (of[1:97, 48:240] for of in (seen_in_thermal(98, 288), thermal))
@@ -128,22 +130,26 @@ def test_ordinary_reader_reads_the_scenes(each: Embedded, folder: Path) -> None:
             assert not sample.thermal[~seen].any()
             continue
         ids = {"synth": scene.label, "synth_kp": kp_ids(scene)}
-        label = ids.get(each.plan.name, PST900_IDS[scene.label])
+        label = ids.get(embedded.plan.name, PST900_IDS[scene.label])
         expected = np.where(label == 19, 255, label)
         assert np.array_equal(sample.label, expected)
         # JPEG loses a few grey levels, of colours more than of grey
-        limit = 3 if each.plan.name == "synth_kp" else 0
+        limit = 3 if embedded.plan.name == "synth_kp" else 0
         assert np.abs(sample.thermal.astype(int) - thermal).mean() <= limit
         assert np.abs(sample.rgb.mean((0, 1)) - rgb.mean((0, 1))).max() <= limit / 3
 
 
 def test_pool_writes_same_files(
-    each: Embedded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    embedded: Embedded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone, pooled = tmp_path / "alone", tmp_path / "pooled"
     for made in (alone, pooled):
         made.mkdir()
-        write(each.layout, replace(each.plan, numbers=dict.fromkeys(each.plan.numbers, 2)), made)
+        write(
+            embedded.layout,
+            replace(embedded.plan, numbers=dict.fromkeys(embedded.plan.numbers, 2)),
+            made,
+        )
         monkeypatch.setattr(export, "_WORTH_A_POOL", 1)
     files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (alone, pooled)]
     assert files[0] == files[1]
@@ -159,7 +165,7 @@ def test_folder_is_named_by_plan_and_reused(
         replace(plan, name="other"),
     ]
     monkeypatch.setattr(export, "write", lambda *_: None)
-    written = [exported(EMPTY, each, tmp_path) for each in plans]
+    written = [exported(EMPTY, plan, tmp_path) for plan in plans]
     monkeypatch.setattr(export, "VERSION", export.VERSION + 1)
     written.append(exported(EMPTY, plans[0], tmp_path))
     assert written[0] == written[1]
@@ -167,9 +173,9 @@ def test_folder_is_named_by_plan_and_reused(
     assert all(path.name.startswith("synth-") for path in written[:6])
 
 
-def test_configuration_has_the_settings_with_their_defaults(each: Embedded) -> None:
+def test_configuration_has_the_settings_with_their_defaults(embedded: Embedded) -> None:
     """All of them for `synth`; presets of it change values alone."""
-    name, make = each.plan.name, getattr(datasets, each.plan.name)
+    name, make = embedded.plan.name, getattr(datasets, embedded.plan.name)
     node: Any = OmegaConf.to_container(compose([f"dataset={name}"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
     assert node.pop("_target_") == f"{make.__module__}.{name}"
@@ -190,7 +196,7 @@ def test_configuration_has_the_settings_with_their_defaults(each: Embedded) -> N
 def test_interrupted_generation_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    each, real = EMBEDDED["synth"], export.write_shot
+    embedded, real = EMBEDDED["synth"], export.write_shot
 
     def interrupted(layout: Layout, plan: Plan, folder: Path, shot: Any) -> None:
         if shot.scene == 3:
@@ -200,9 +206,9 @@ def test_interrupted_generation_leaves_nothing(
     with monkeypatch.context() as patch:
         patch.setattr(export, "write_shot", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            each.made(tmp_path)
+            embedded.made(tmp_path)
     assert list(tmp_path.iterdir()) == []
-    assert (each.made(tmp_path).root / "test.txt").is_file()
+    assert (embedded.made(tmp_path).root / "test.txt").is_file()
 
 
 def test_first_of_two_generations_is_kept(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_label_and_depth_of_a_box_follow_the_camera() -> None:
     top = [(-1, 1, 10), (1, 1, 10), (1, 1, 12), (-1, 1, 12)]
     front = [(-1, 0, 10), (1, 0, 10), (1, 1, 10), (-1, 1, 10)]
     meta = (INDEX["paint"], CAR, 0, 1)
-    shape = Shape.of("box", [(np.array(each, np.float32), meta) for each in (top, front)])
+    shape = Shape.of("box", [(np.array(face, np.float32), meta) for face in (top, front)])
     facets = facets_of(ground_quads(draw_road(0, 0, FACTORS)), [Placed(shape, 0.0, 0.0)])
     drawing = draw(facets, camera)
     label = np.concatenate([[0], facets.label])[drawing.ids]
@@ -224,7 +224,7 @@ def test_label_and_depth_of_a_box_follow_the_camera() -> None:
     # A face that is solid is seen where its normal points at the camera: of these, from behind.
     seen = []
     for way in (1, -1):
-        faces = [(np.array(each[::way], np.float32), (*meta[:3], 0)) for each in (top, front)]
+        faces = [(np.array(face[::way], np.float32), (*meta[:3], 0)) for face in (top, front)]
         box = Placed(Shape.of("box", faces), 0.0, 0.0)
         made = facets_of(ground_quads(draw_road(0, 0, FACTORS)), [box])
         seen.append((np.concatenate([[0], made.label])[draw(made, camera).ids] == CAR).sum())

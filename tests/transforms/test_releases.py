@@ -37,7 +37,7 @@ def plain(sample: Sample, dtype: Any = np.uint8) -> Arrays:
 
 
 def changed(arrays: Arrays, image: Step, exact: Step) -> Arrays:
-    return {name: (image if name in IMAGES else exact)(each) for name, each in arrays.items()}
+    return {name: (image if name in IMAGES else exact)(values) for name, values in arrays.items()}
 
 
 def mirrored(arrays: Arrays, yes: bool) -> Arrays:
@@ -45,19 +45,19 @@ def mirrored(arrays: Arrays, yes: bool) -> Arrays:
 
 
 def cut(arrays: Arrays, top: int, left: int, height: int, width: int) -> Arrays:
-    def part(each: np.ndarray) -> np.ndarray:
-        return each[top : top + height, left : left + width]
+    def part(values: np.ndarray) -> np.ndarray:
+        return values[top : top + height, left : left + width]
 
     return changed(arrays, part, part)
 
 
 def resized(arrays: Arrays, hw: tuple[int, int], how: int = cv2.INTER_LINEAR_EXACT) -> Arrays:
-    def nearest(each: np.ndarray) -> np.ndarray:
-        found = F.interpolate(torch.from_numpy(each.copy())[None, None], hw, mode="nearest")
+    def nearest(values: np.ndarray) -> np.ndarray:
+        found = F.interpolate(torch.from_numpy(values.copy())[None, None], hw, mode="nearest")
         return found[0, 0].numpy()
 
-    def image(each: np.ndarray) -> np.ndarray:
-        return cv2.resize(np.ascontiguousarray(each), hw[::-1], interpolation=how)
+    def image(values: np.ndarray) -> np.ndarray:
+        return cv2.resize(np.ascontiguousarray(values), hw[::-1], interpolation=how)
 
     return changed(arrays, image, nearest)
 
@@ -147,7 +147,7 @@ def thesis(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
 
 def softened(arrays: Arrays, side: int) -> Arrays:
     soft = {key: np.ascontiguousarray(arrays[key]) for key in IMAGES}
-    return arrays | {key: cv2.GaussianBlur(each, (side, side), 0) for key, each in soft.items()}
+    return arrays | {key: cv2.GaussianBlur(image, (side, side), 0) for key, image in soft.items()}
 
 
 def turned(arrays: Arrays, angle: float, middle_xy: Any, fills: Any, middle_yx: Any) -> Arrays:
@@ -280,8 +280,8 @@ def test_labels_and_positions_may_be_missing(name: str) -> None:
     for number in range(4):
         sample = noise(number)
         whole, bare = (
-            transform.train(each, np.random.default_rng(number))
-            for each in (sample, replace(sample, label=None, confidence=None))
+            transform.train(given, np.random.default_rng(number))
+            for given in (sample, replace(sample, label=None, confidence=None))
         )
         assert (bare.label == IGNORE).all()
         assert bare.confidence is None

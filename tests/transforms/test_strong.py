@@ -86,7 +86,7 @@ def test_thermal_has_its_own_draws_and_one_channel() -> None:
         torch.testing.assert_close(y, y[0] + slope * (x - x[0]), atol=1e-5, rtol=0)
         slopes.append(round(slope.item(), 3))
     assert len(set(slopes)) == 3
-    assert all(0.8 <= each <= 1.2 for each in slopes)
+    assert all(0.8 <= slope <= 1.2 for slope in slopes)
 
 
 def test_draws_are_replayed_and_their_number_is_fixed() -> None:

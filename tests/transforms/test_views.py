@@ -233,13 +233,13 @@ def test_the_mark_tells_views_apart_by_what_they_show(tmp_path: Path) -> None:
         path.write_text("\n".join(["yaw,pitch,roll", *rows]))
     narrow = released(yaw=(-9.0, 3.0))  # nothing is drawn
     same = [sets(*PUBLISHED), sets(*map(str, copies)), sets(*PUBLISHED, view=narrow)]
-    assert [each.mark for each in same] == ["", "", ""]
+    assert [views.mark for views in same] == ["", "", ""]
     changes: tuple[dict[str, Any], ...] = (
         *({"order": "zyx"}, {"rectangle": "largest"}, {"resampling": "once"}),
         *({"mode": "rotation"}, {"outside": "ignore"}, {"camera": replace(CAMERA, fx=500.0)}),
     )
-    others = [sets(*PUBLISHED, view=released(**each)) for each in changes]
-    marks = {each.mark for each in (*others, sets("released_1"), sets(*reversed(PUBLISHED)))}
+    others = [sets(*PUBLISHED, view=released(**change)) for change in changes]
+    marks = {views.mark for views in (*others, sets("released_1"), sets(*reversed(PUBLISHED)))}
     assert (len(marks), {len(mark) for mark in marks}) == (8, {6})
 
 

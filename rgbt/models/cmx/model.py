@@ -16,11 +16,11 @@ from torch.nn import functional as F
 
 from rgbt.models.cmx.parts import (
     NORM_EPS,
-    Fusion,
-    MitPatchEmbed,
     Rectification,
+    StreamFusion,
     initialise,
     mit_blocks,
+    mit_patch_embed,
 )
 from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.models.parts import Keep, check_heads, drop_channels, stochastic_depth
@@ -32,7 +32,7 @@ STREAMS = ("", "extra_")  # before the names of the modules: RGB, and the other 
 
 
 class Stream(NamedTuple):
-    """What one stream is made of."""
+    """Says what one stream is made of."""
 
     in_channels: int  # channels of the image
     block: Callable[[int], nn.Module]  # makes a block of stage 0..3
@@ -41,7 +41,7 @@ class Stream(NamedTuple):
 
 
 class CmxEncoder(nn.Module):
-    """Two streams with weights of their own that meet after every stage.
+    """Computes maps of two streams with weights of their own, which meet after every stage.
 
     The next stage continues with what the rectification returns; the decoder reads what the fusion
     returns.   Source: CMX, Sec. III-A.
@@ -64,7 +64,7 @@ class CmxEncoder(nn.Module):
             before = stream.in_channels
             for stage, (dim, depth) in enumerate(zip(embed_dims, depths, strict=True)):
                 kernel, stride = (3, 2) if stage else (7, 4)
-                embed = MitPatchEmbed(before, dim, kernel, stride, norm_eps=stream.embed_eps)
+                embed = mit_patch_embed(before, dim, kernel, stride, norm_eps=stream.embed_eps)
                 blocks = nn.ModuleList(stream.block(stage) for _ in range(depth))
                 self.add_module(f"{prefix}patch_embed{stage + 1}", embed)
                 self.add_module(f"{prefix}block{stage + 1}", blocks)
@@ -72,11 +72,11 @@ class CmxEncoder(nn.Module):
                 before = dim
         self.FRMs = nn.ModuleList(Rectification(dim) for dim in embed_dims)
         self.FFMs = nn.ModuleList(
-            Fusion(dim, heads) for dim, heads in zip(embed_dims, num_heads, strict=True)
+            StreamFusion(dim, heads) for dim, heads in zip(embed_dims, num_heads, strict=True)
         )
 
     def forward(self, images: Images, generator: torch.Generator | None) -> list[Tensor]:
-        """Fused maps of the four stages, (N, h, w, C_s): H and W over 4, 8, 16, 32, rounded up."""
+        """Return fused maps of four stages, (N, h, w, C_s): H and W over 4 to 32, rounded up."""
         rgb, thermal = (image.permute(0, 2, 3, 1).contiguous() for image in images)
         rates = self.drop_rates if self.training else None
         keeps = stochastic_depth(rates, 2 * self.depths, rgb, generator)
@@ -89,24 +89,22 @@ class CmxEncoder(nn.Module):
         return fused
 
     def _stage(self, prefix: str, stage: int, x: Tensor, keeps: Sequence[Keep]) -> Tensor:
-        embed, blocks, norm = (
-            self.get_submodule(f"{prefix}{name}{stage + 1}")
-            for name in ("patch_embed", "block", "norm")
-        )
-        x = embed(x)
-        for block, keep in zip(blocks.children(), keeps, strict=True):
+        x = self.get_submodule(f"{prefix}patch_embed{stage + 1}")(x)
+        blocks = self.get_submodule(f"{prefix}block{stage + 1}").children()
+        for block, keep in zip(blocks, keeps, strict=True):
             x = block(x, keep)
-        return norm(x)
+        return self.get_submodule(f"{prefix}norm{stage + 1}")(x)
 
 
 class MlpDecoder(nn.Module):
-    """Every map to E channels, enlarged to the first one's size, joined, mixed and classified.
+    """Projects every map to E channels, enlarges them, joins and mixes them, and predicts classes.
 
         ReLU(BatchNorm(conv1x1([c4, c3, c2, c1]))),  c_i = enlarge(linear_i(x_i))
 
-    Enlarging is linear and its weights sum to 1, so that it may follow the convolution: each map
-    meets its own part of it at its own size, and two linear maps are one. The same numbers to
-    rounding, at a fraction of the operations and without the map of 4 E channels.
+    Enlarging is linear and its weights sum to 1, so that it may follow the convolution: each map is
+    multiplied by its own columns of the weight at its own size, and by both matrices at once. The
+    numbers are the same to rounding, at a fraction of the operations and without a map of 4 E
+    channels.
 
     Source: SegFormer, Sec. 3.2, Eq. (4); CMX, Sec. III-A.
 
@@ -137,14 +135,14 @@ class MlpDecoder(nn.Module):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
 
     def train(self, mode: bool = True) -> MlpDecoder:
-        """Set the mode, and the eps of all layers that normalise a batch."""
+        """Set the mode, and the eps that belongs to it."""
         self.linear_fuse[1].eps = self.norm_eps[0 if mode else 1]  # type: ignore[assignment]
         return super().train(mode)
 
     def forward(
         self, maps: list[Tensor], image_hw: Sequence[int], generator: torch.Generator | None = None
     ) -> Tensor:
-        """Class scores (N, K, H, W) float32 of four (N, H_i, W_i, C_i), the largest first.
+        """Predict class scores (N, K, H, W) float32 from four (N, H_i, W_i, C_i), largest first.
 
         They are computed at the size of the first map, a quarter of the image, and enlarged.
         """
@@ -170,7 +168,7 @@ def _resized(x: Tensor, hw: Sequence[int]) -> Tensor:
 
 
 class CmxNetwork(Network):
-    """Two streams and the decoder; CMX and CMNeXt differ in what these are made of."""
+    """Predicts by two streams and the decoder; CMX and CMNeXt differ in what these are made of."""
 
     record = NetworkRecord(
         views=("rgbt",),
@@ -186,7 +184,7 @@ class CmxNetwork(Network):
         self.inputs = inputs
 
     def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:  # noqa: ARG002
-        """Class scores of every pixel, float32; `aux` is empty.
+        """Predict class scores of every pixel, float32; `aux` is empty.
 
         Sides may have any length from 29 (with the released `sr_ratios`). Stochastic depth is drawn
         per sample, block and stream, then the decoder's dropped channels.
@@ -203,7 +201,7 @@ Stage2 = Literal["ramp", "released"]
 
 
 class CMX(CmxNetwork):
-    """CMX with MiT streams for RGB and thermal.
+    """Predicts from both images by CMX with MiT streams.
 
     Source: J. Zhang et al., CMX: Cross-Modal Fusion for RGB-X Semantic Segmentation With
     Transformers, T-ITS 2023; the network of the temporal paper, too.   Released:
@@ -250,7 +248,7 @@ class CMX(CmxNetwork):
 
 
 def drop_rates(depths: Depths, last: float, stage2: Stage2 = "ramp") -> Tensor | None:
-    """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
+    """Return stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
 
     Rates rise evenly from 0 to `last`. `stage2` "released": stage 2 has one rate per stream, that
     of its first block for RGB and the next one on the ramp for thermal.

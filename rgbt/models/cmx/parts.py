@@ -1,9 +1,9 @@
 """Parts of CMX: the Mix Transformer (MiT) of a stream, and the modules between the streams.
 
-Maps are (N, H, W, C) throughout, which is a sequence of tokens and an image that convolutions
-take as it is (channels last), so that nothing is copied between the two. Of the modules between the
-streams, rectification (FRM; CMX, Sec. III-B) follows every stage and fusion (FFM; Sec. III-C) feeds
-the decoder; x1 is RGB, x2 thermal.
+Maps are (N, H, W, C) throughout. Linear layers take them as tokens, convolutions (`MapConv`) as
+images in the memory format "channels last", so that nothing is copied between the two. Of the
+modules between the streams, rectification (FRM; CMX, Sec. III-B) follows every stage and fusion
+(FFM; Sec. III-C) feeds the decoder; x1 is RGB, x2 thermal.
 """
 
 from __future__ import annotations
@@ -21,28 +21,27 @@ from rgbt.ranges import Widths
 NORM_EPS = 1e-5  # in patch embeddings and of keys, and in all of CMNeXt's RGB stream
 
 
-def convolve(convolution: nn.Module, x: Tensor) -> Tensor:
-    """A module that expects (N, C, H, W), on (N, H, W, C) without a copy."""
-    return convolution(x.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+class MapConv(nn.Conv2d):
+    """Convolves maps (N, H, W, C) without a copy."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(N, H, W, c) -> (N, h, w, C)."""
+        return super().forward(input.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
 
-class MitPatchEmbed(nn.Module):
-    """One token per patch; neighbouring patches overlap."""
+def mit_patch_embed(
+    in_channels: int, dim: int, kernel: int, stride: int, *, norm_eps: float
+) -> nn.Sequential:
+    """Make the embedding of overlapping patches as normalised tokens.
 
-    def __init__(
-        self, in_channels: int, dim: int, kernel: int, stride: int, *, norm_eps: float
-    ) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(in_channels, dim, kernel, stride=stride, padding=kernel // 2)
-        self.norm = nn.LayerNorm(dim, eps=norm_eps)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, H, W, c) -> (N, ceil(H / stride), ceil(W / stride), C)."""
-        return self.norm(convolve(self.proj, x))
+    (N, H, W, c) -> (N, ceil(H / stride), ceil(W / stride), C).
+    """
+    proj = MapConv(in_channels, dim, kernel, stride=stride, padding=kernel // 2)
+    return nn.Sequential(OrderedDict(proj=proj, norm=nn.LayerNorm(dim, eps=norm_eps)))
 
 
 class MitAttention(nn.Module):
-    """Multi-head attention to a map whose sides are `reduction` times smaller.
+    """Attends with several heads to a map whose sides are `reduction` times smaller.
 
         softmax(q k' / sqrt(d)) v,   k and v from LayerNorm(conv(x)), kernel = stride = reduction
 
@@ -56,13 +55,13 @@ class MitAttention(nn.Module):
         self.kv = nn.Linear(dim, 2 * dim)
         self.proj = nn.Linear(dim, dim)
         if reduction > 1:
-            self.sr = nn.Conv2d(dim, dim, reduction, stride=reduction)
+            self.sr = MapConv(dim, dim, reduction, stride=reduction)
             self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, H, W, C) -> (N, H, W, C), sides at least `reduction`."""
         n, _, _, dim = x.shape
-        seen = self.norm(convolve(self.sr, x)) if self.reduction > 1 else x
+        seen = self.norm(self.sr(x)) if self.reduction > 1 else x
         q = self.q(x).view(n, -1, self.heads, dim // self.heads).transpose(1, 2)
         kv = self.kv(seen).view(n, -1, 2, self.heads, dim // self.heads)
         k, v = kv.permute(2, 0, 3, 1, 4)
@@ -70,39 +69,36 @@ class MitAttention(nn.Module):
         return self.proj(out.transpose(1, 2).reshape(x.shape))
 
 
-class MixFfn(nn.Module):
-    """Linear, depthwise 3x3 convolution, exact GELU, linear.
+def mix_ffn(first: nn.Module, depthwise: nn.Module, last: nn.Module) -> nn.Sequential:
+    """Make a feed-forward network of three layers, with an exact GELU before the last one.
 
+    Linear layers around a depthwise 3x3 convolution in MiT, convolutions alone in CMNeXt.
     Source: SegFormer, Sec. 3.1, Eq. (3).
     """
-
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        depthwise = nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)
-        self.dwconv = nn.Sequential(OrderedDict(dwconv=depthwise))  # the released name
-        self.fc2 = nn.Linear(hidden, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, H, W, C) -> (N, H, W, C)."""
-        return self.fc2(F.gelu(convolve(self.dwconv, self.fc1(x))))
+    named = nn.Sequential(OrderedDict(dwconv=depthwise))  # the released name
+    return nn.Sequential(OrderedDict(fc1=first, dwconv=named, act=nn.GELU(), fc2=last))
 
 
 def mit_blocks(
     dims: Widths, heads: Widths, reductions: Widths, ratio: float, *, norm_eps: float
 ) -> Callable[[int], ResidualBlock]:
-    """What makes a block of stage 0..3; arguments as in `CMX`."""
+    """Return the function that makes a block of stage 0..3; arguments as in `CMX`."""
 
     def block(stage: int) -> ResidualBlock:
         attention = MitAttention(dims[stage], heads[stage], reductions[stage])
-        mlp = MixFfn(dims[stage], int(dims[stage] * ratio))
-        return ResidualBlock(dims[stage], attention, mlp, norm_eps=norm_eps)
+        dim, hidden = dims[stage], int(dims[stage] * ratio)
+        mlp = mix_ffn(
+            nn.Linear(dim, hidden),
+            MapConv(hidden, hidden, 3, padding=1, groups=hidden),
+            nn.Linear(hidden, dim),
+        )
+        return ResidualBlock(dim, attention, mlp, norm_eps=norm_eps)
 
     return block
 
 
 def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:
-    """Starting weights, before ImageNet's.   Source: SegFormer and CMX releases.
+    """Draw starting weights, before ImageNet's.   Source: SegFormer and CMX releases.
 
     Linear: normal with deviation 0.02; convolution: normal with variance 2 / (outputs that one
     input value reaches), in CMNeXt counted in all groups (`divide_groups` False); biases 0.
@@ -118,65 +114,39 @@ def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:
         nn.init.zeros_(module.bias)
 
 
-class ChannelWeights(nn.Module):
-    """How much of each channel of a map the other stream takes up, from the whole image.
-
-    sigmoid(MLP([mean(x1), mean(x2), max(x1), max(x2)]))
-    """
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(
-            nn.Linear(4 * dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, 2 * dim)
-        )
-
-    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        """Two (N, H, W, C) -> (2, N, 1, 1, C) in (0, 1): weights on x1, weights on x2."""
-        maps = [x.flatten(1, 2) for x in (x1, x2)]
-        # One of equal maxima has the gradient, as in the release: hidden pixels make such ties.
-        pooled = [x.mean(1) for x in maps] + [x.max(1).values for x in maps]
-        weights = self.mlp(torch.cat(pooled, 1)).sigmoid()
-        return weights.view(x1.shape[0], 2, 1, 1, -1).transpose(0, 1)
-
-
-class SpatialWeights(nn.Module):
-    """How much of each position of a map the other stream takes up.
-
-    sigmoid(conv1x1(ReLU(conv1x1([x1, x2]))))
-    """
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(nn.Conv2d(2 * dim, dim, 1), nn.ReLU(), nn.Conv2d(dim, 2, 1))
-
-    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        """Two (N, H, W, C) -> (2, N, H, W, 1) in (0, 1): weights on x1, weights on x2."""
-        weights = convolve(self.mlp, torch.cat([x1, x2], -1)).sigmoid()
-        return weights.permute(3, 0, 1, 2).unsqueeze(-1)
-
-
 class Rectification(nn.Module):
-    """FRM: each stream takes up what the other one is sure of.
+    """FRM: adds to each stream what the other one is sure of.
 
         x1 + 1/2 (Wc2 + Ws2) x2   and   x2 + 1/2 (Wc1 + Ws1) x1
+        Wc = sigmoid(MLP([mean(x1), mean(x2), max(x1), max(x2)]))     of channels, from all pixels
+        Ws = sigmoid(conv1x1(ReLU(conv1x1([x1, x2]))))                of positions
 
     with lambda_C = lambda_S = 1/2.
     """
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.channel_weights = ChannelWeights(dim)
-        self.spatial_weights = SpatialWeights(dim)
+        mlp = nn.Sequential(nn.Linear(4 * dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, 2 * dim))
+        self.channel_weights = nn.Sequential(OrderedDict(mlp=mlp, share=nn.Sigmoid()))
+        mlp = nn.Sequential(MapConv(2 * dim, dim, 1), nn.ReLU(), MapConv(dim, 2, 1))
+        self.spatial_weights = nn.Sequential(OrderedDict(mlp=mlp, share=nn.Sigmoid()))
 
     def forward(self, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
         """Two (N, H, W, C) -> the two rectified ones."""
-        weights = self.channel_weights(x1, x2) + self.spatial_weights(x1, x2)
-        first, second = (0.5 * weights).unbind()
+        maps = [x.flatten(1, 2) for x in (x1, x2)]
+        # One of equal maxima has the gradient, as in the release: hidden pixels make such ties.
+        pooled = [x.mean(1) for x in maps] + [x.max(1).values for x in maps]
+        # Weights on x1, then on x2: (2, N, 1, 1, C) of channels and (2, N, H, W, 1) of positions.
+        of_channels = self.channel_weights(torch.cat(pooled, 1))
+        of_channels = of_channels.view(x1.shape[0], 2, 1, 1, -1).transpose(0, 1)
+        of_positions = self.spatial_weights(torch.cat([x1, x2], -1))
+        of_positions = of_positions.permute(3, 0, 1, 2).unsqueeze(-1)
+        first, second = (0.5 * (of_channels + of_positions)).unbind()
         return torch.addcmul(x1, x2, second), torch.addcmul(x2, x1, first)
 
 
 class CrossAttention(nn.Module):
-    """Each stream reads the other's global context, at a cost linear in the number of tokens.
+    """Lets each stream read the other's global context, at a cost linear in the number of tokens.
 
         z1 = u1 softmax(k2' v2 / sqrt(d)),  z2 = u2 softmax(k1' v1 / sqrt(d)),  [k, v] = u W
 
@@ -206,7 +176,7 @@ class CrossAttention(nn.Module):
 
 
 class CrossPath(nn.Module):
-    """Half of each stream's projection stays, the other half meets the other stream's."""
+    """Keeps half of each stream's projection, and lets the other half read the other stream's."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -228,36 +198,30 @@ class CrossPath(nn.Module):
         return out1, out2
 
 
-class ChannelEmbed(nn.Module):
-    """Both streams mixed into one: a 1x1 shortcut and a path with a depthwise convolution."""
+class StreamFusion(nn.Module):
+    """FFM: exchanges global context, then mixes both streams into one map.
 
-    def __init__(self, dim: int) -> None:
+    They are mixed by a 1x1 shortcut and a path with a depthwise convolution.
+    """
+
+    def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
-        self.residual = nn.Conv2d(2 * dim, dim, 1, bias=False)
-        self.channel_embed = nn.Sequential(
+        self.cross = CrossPath(dim, heads)
+        path = nn.Sequential(
             nn.Conv2d(2 * dim, dim, 1),
             nn.Conv2d(dim, dim, 3, padding=1, groups=dim),
             nn.ReLU(),
             nn.Conv2d(dim, dim, 1),
             nn.BatchNorm2d(dim),
         )
-        self.norm = nn.BatchNorm2d(dim)
-
-    def forward(self, both: Tensor) -> Tensor:
-        """(N, H, W, 2C) -> (N, H, W, C)."""
-        both = both.permute(0, 3, 1, 2)
-        return self.norm(self.residual(both) + self.channel_embed(both)).permute(0, 2, 3, 1)
-
-
-class Fusion(nn.Module):
-    """FFM: exchange of global context, then both streams mixed into one map."""
-
-    def __init__(self, dim: int, heads: int) -> None:
-        super().__init__()
-        self.cross = CrossPath(dim, heads)
-        self.channel_emb = ChannelEmbed(dim)
+        self.channel_emb = nn.ModuleDict()
+        self.channel_emb["residual"] = nn.Conv2d(2 * dim, dim, 1, bias=False)
+        self.channel_emb["channel_embed"] = path
+        self.channel_emb["norm"] = nn.BatchNorm2d(dim)
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
         """Two (N, H, W, C) -> (N, H, W, C)."""
         streams = self.cross(x1.flatten(1, 2), x2.flatten(1, 2))
-        return self.channel_emb(torch.cat(streams, -1).view(*x1.shape[:3], -1))
+        both = torch.cat(streams, -1).view(*x1.shape[:3], -1).permute(0, 3, 1, 2)
+        shortcut, path, norm = self.channel_emb.children()
+        return norm(shortcut(both) + path(both)).permute(0, 2, 3, 1)

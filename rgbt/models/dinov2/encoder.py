@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.parts import Mlp, check_heads
+from rgbt.models.parts import check_heads, feed_forward
 
 OFFSET = 0.1  # patches added to the size when positions are enlarged by a factor (DINOv2 release)
 
@@ -30,7 +30,7 @@ Rotation = tuple[Tensor, Tensor]
 
 
 class LoraProjection(nn.Module):
-    """What is added to the joint projection of queries, keys and values of one block.
+    """Computes what is added to the joint projection of queries, keys and values of one block.
 
         alpha / rank * B A x,  for each of `parts`, 0 for the others
 
@@ -59,7 +59,7 @@ class LoraProjection(nn.Module):
 
 
 class RotaryPositions(nn.Module):
-    """Angles of the channels of a head for every token.
+    """Computes the angles of the channels of a head for every token.
 
         2 pi y / period and 2 pi x / period,  period = base ** (j / (D / 4)),  j = 0 .. D / 4 - 1
 
@@ -78,7 +78,7 @@ class RotaryPositions(nn.Module):
         self.register_buffer("periods", base**exponents)
 
     def forward(self, hw: tuple[int, int], num_first: int) -> Rotation:
-        """The rotation of `num_first` tokens without a position, which is none, and of h x w."""
+        """Return the rotation of `num_first` tokens without a position (none), and of h x w."""
         rows, columns = (self._angles(side) for side in hw)
         rows, columns = rows[:, None].expand(-1, hw[1], -1), columns.expand(hw[0], -1, -1)
         angles = torch.cat([rows, columns], dim=-1).flatten(0, 1).tile(2)
@@ -92,7 +92,7 @@ class RotaryPositions(nn.Module):
 
 
 def rotated(x: Tensor, rotation: Rotation) -> Tensor:
-    """Channels j and j + D / 2 of (N, heads, T, D) rotated as a pair, in single precision."""
+    """Rotate channels j and j + D / 2 of (N, heads, T, D) as a pair, in single precision."""
     cos, sin = rotation
     first, second = x.chunk(2, dim=-1)
     turned = torch.cat([-second, first], dim=-1)
@@ -100,7 +100,7 @@ def rotated(x: Tensor, rotation: Rotation) -> Tensor:
 
 
 class KeylessLinear(nn.Linear):
-    """Joint projection of queries, keys and values with a bias whose third for keys counts as 0.
+    """Projects to queries, keys and values, with a bias whose third for keys counts as 0.
 
     Source: DINOv3 release, `layers/attention.py`, mask_k_bias.
     """
@@ -113,7 +113,7 @@ class KeylessLinear(nn.Linear):
 
 
 class Attention(nn.Module):
-    """Multi-head attention among all tokens.
+    """Attends with several heads to all tokens.
 
         softmax(q k' / sqrt(d / heads)) v
 
@@ -138,20 +138,8 @@ class Attention(nn.Module):
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
-class LayerScale(nn.Module):
-    """One factor per channel, 1 at first (DINOv2 release; DINOv3's own training: 1e-5)."""
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.ones(dim))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., d) -> (..., d)."""
-        return x * self.gamma
-
-
 class GatedMlp(nn.Module):
-    """``w3(silu(w1 x) * w2 x)``, the MLP of DINOv3's larger forms.
+    """Computes ``w3(silu(w1 x) * w2 x)``, the MLP of DINOv3's larger forms.
 
     Source: Shazeer, GLU Variants Improve Transformer (2020), Eq. (6); biases: DINOv3 release.
     """
@@ -168,11 +156,12 @@ class GatedMlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention and MLP, each normalised before, scaled by channel and added to its input.
+    """Adds to its input attention, then an MLP, each of the normalised input, scaled by channel.
 
         x + s1 attention(norm(x)),  then  x + s2 mlp(norm(x))
 
-    Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (ICCV 2021).
+    Source: Vision Transformer, Eqs. (2) and (3); s1 and s2 (LayerScale): CaiT (ICCV 2021). They are
+    1 at first, as in DINOv2's release; DINOv3's own training begins with 1e-5.
     """
 
     def __init__(
@@ -181,21 +170,21 @@ class Block(nn.Module):
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
         self.attn = Attention(dim, heads, key_bias=key_bias)
-        self.ls1 = LayerScale(dim)
+        self.ls1 = nn.ParameterDict({"gamma": torch.ones(dim)})
         self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
-        self.mlp = (GatedMlp if mlp == "swiglu" else Mlp)(dim, hidden)
-        self.ls2 = LayerScale(dim)
+        self.mlp = GatedMlp(dim, hidden) if mlp == "swiglu" else feed_forward(dim, hidden)
+        self.ls2 = nn.ParameterDict({"gamma": torch.ones(dim)})
 
     def forward(
         self, x: Tensor, lora: LoraProjection | None = None, rotation: Rotation | None = None
     ) -> Tensor:
         """(N, T, d) -> (N, T, d)."""
-        x = x + self.ls1(self.attn(self.norm1(x), lora, rotation))
-        return x + self.ls2(self.mlp(self.norm2(x)))
+        x = x + self.attn(self.norm1(x), lora, rotation) * self.ls1["gamma"]
+        return x + self.mlp(self.norm2(x)) * self.ls2["gamma"]
 
 
 def resized_positions(positions: Tensor, hw: tuple[int, int], position_resize: Resize) -> Tensor:
-    """Positions of the class token and of h x w patches.
+    """Resize learned positions to those of the class token and of h x w patches.
 
     Source: DINOv2 release, `interpolate_pos_encoding`: both forms are bicubic. "factor", of the
     files without registers, enlarges the grid by ((h + 0.1) / g, (w + 0.1) / g) without
@@ -217,7 +206,7 @@ def resized_positions(positions: Tensor, hw: tuple[int, int], position_resize: R
 
 
 class Encoder(nn.Module):
-    """Patch embedding, positions, registers and blocks.
+    """Computes patch tokens by the vision transformer of DINOv2 or DINOv3.
 
     Source: DINOv2 (Oquab et al., TMLR 2024); registers: Darcet et al., "Vision Transformers Need
     Registers" (ICLR 2024), Sec. 2.2; rotary positions, bias and MLP: DINOv3 (Siméoni et al., 2025),
@@ -285,7 +274,7 @@ class Encoder(nn.Module):
         added: Tensor | None = None,
         lora: nn.ModuleList | None = None,
     ) -> list[Tensor]:
-        """Normalised patch tokens after some of the blocks, as maps (N, d, h, w).
+        """Return normalised patch tokens after some of the blocks, as maps (N, d, h, w).
 
         Args:
             image: (N, 3, H, W) normalised, sides multiples of the patch.
@@ -310,7 +299,7 @@ class Encoder(nn.Module):
             first, x = [self.cls_token + positions[:, :1]], x + positions[:, 1:]
         if self.num_registers:  # registers have no position
             first.append(self.register_tokens)
-        x = torch.cat([*(each.expand(x.shape[0], -1, -1) for each in first), x], 1)
+        x = torch.cat([*(token.expand(x.shape[0], -1, -1) for token in first), x], 1)
 
         maps = []
         for number, block in enumerate(self.blocks[: layers[-1]], 1):

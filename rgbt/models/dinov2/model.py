@@ -30,54 +30,36 @@ STRIDES = (4, 8, 16, 32)
 
 
 class ChannelNorm(nn.LayerNorm):
-    """Layer normalisation over the channels of maps."""
+    """Normalises the channels of every pixel of maps."""
 
     def forward(self, input: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, C, h, w)."""
         return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-class Level(nn.Sequential):
-    """A map of one stride from a map with one token per `token_px` pixels.
+def pyramid_level(dim: int, *, token_px: int, stride: int) -> nn.Sequential:
+    """Make the layers from a map with one token per `token_px` pixels to a map of one stride.
 
-    Each doubling of the size halves the channels. `width` is their number.
-    """
-
-    def __init__(self, dim: int, *, token_px: int, stride: int) -> None:
-        layers: list[nn.Module] = []
-        width, size = dim, token_px
-        while size > stride:
-            layers += [ChannelNorm(width), nn.GELU()] if layers else []
-            layers.append(nn.ConvTranspose2d(width, width // 2, 2, stride=2))
-            width, size = width // 2, size // 2
-        if size < stride:
-            layers.append(nn.MaxPool2d(stride // size))
-        super().__init__(*layers, ChannelNorm(width))
-        self.width = width
-
-
-class Pyramid(nn.ModuleList):
-    """Maps at strides 4, 8, 16 and 32 from maps of one size.
+    Each doubling of the size halves the channels.
 
     Source: ViTDet (Li et al., ECCV 2022), Sec. 3, "simple feature pyramid"; layers as in detectron2
     (`modeling/backbone/vit.py`, SimpleFeaturePyramid). Its last 1x1 and 3x3 convolutions of each
     level are left out, because Mask2Former's pixel decoder begins with convolutions of its own.
     """
-
-    def __init__(self, dim: int, token_px: int) -> None:
-        levels = [Level(dim, token_px=token_px, stride=stride) for stride in STRIDES]
-        super().__init__(levels)
-        first, second, third, last = (level.width for level in levels)
-        self.widths = first, second, third, last
-
-    def forward(self, maps: Maps) -> Maps:
-        """One (N, d, h, w), or one for each level, to four (N, C_s, H/s, W/s)."""
-        sources = maps if len(maps) > 1 else maps * len(self)
-        return [level(source) for level, source in zip(self, sources, strict=True)]
+    layers: list[nn.Module] = []
+    width, size = dim, token_px
+    while size > stride:
+        if layers:
+            layers += [ChannelNorm(width), nn.GELU()]
+        layers.append(nn.ConvTranspose2d(width, width // 2, 2, stride=2))
+        width, size = width // 2, size // 2
+    if size < stride:
+        layers.append(nn.MaxPool2d(stride // size))
+    return nn.Sequential(*layers, ChannelNorm(width))
 
 
 class DinoBackbone(nn.Module):
-    """RGB and thermal through the same encoder, a pyramid each, and their fusion.
+    """Passes RGB and thermal through one encoder and a pyramid each; the fusion is here too.
 
     Sources: fusion: CRM, Sec. III-B. Ours: the shared encoder, with a vector that is added to the
     patch tokens of thermal images (0 at first) and low-rank updates for both or for each modality.
@@ -100,12 +82,20 @@ class DinoBackbone(nn.Module):
         (dim,) = encoder.norm.normalized_shape
         self.thermal_embedding = nn.Parameter(torch.zeros(dim)) if thermal_embedding else None
         self.lora = nn.ModuleDict(dict(lora))
-        first, second = (Pyramid(dim, token_px) for _ in MODALITIES)
-        self.pyramids = nn.ModuleDict({"rgb": first, "thermal": second})
-        self.norm_layers = Fusion(first.widths, fusion)
+        self.pyramids = nn.ModuleDict()
+        for modality in MODALITIES:
+            self.pyramids[modality] = nn.ModuleList(
+                pyramid_level(dim, token_px=token_px, stride=stride) for stride in STRIDES
+            )
+        # The width of a level: see `pyramid_level`.
+        first, second, third, last = (dim * min(stride, token_px) // token_px for stride in STRIDES)
+        self.norm_layers = Fusion((first, second, third, last), fusion)
 
     def maps(self, modality: str, image: Tensor, hidden: Tensor | None, _: object) -> Maps:
-        """(N, c, H, W) and (N, h, w); images are resized so that a patch has `token_px` pixels."""
+        """Return maps of four strides, (N, C_s, H/s, W/s), of (N, c, H, W) and (N, h, w).
+
+        Images are resized so that a patch has `token_px` pixels.
+        """
         image, patch = as_rgb(image), self.encoder.patch
         if patch != self.token_px:
             height, width = (side // self.token_px * patch for side in image.shape[-2:])
@@ -118,11 +108,13 @@ class DinoBackbone(nn.Module):
             added=self.thermal_embedding if modality == "thermal" else None,
             lora=self.lora[owner] if len(self.lora) else None,
         )
-        return self.pyramids[modality](tokens)
+        levels = list(self.pyramids[modality].children())
+        sources = tokens if len(tokens) > 1 else tokens * len(levels)
+        return [level(source) for level, source in zip(levels, sources, strict=True)]
 
 
 class DinoMask2Former(MaskNetwork):
-    """RGB and thermal through one vision transformer, fused as in CRM, with Mask2Former's head.
+    """Predicts by one vision transformer for both images, fused as in CRM, and Mask2Former's head.
 
     Sources: encoder: DINOv2 (Oquab et al., TMLR 2024) or DINOv3 (Siméoni et al., 2025); pyramid:
     ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.

@@ -50,7 +50,7 @@ def replace_in(owner: Any, **attributes: Any) -> None:
 
 
 def replaced(module: ModuleType, **attributes: Any) -> ModuleType:
-    """A module with other objects under some names; the module itself stays as it is.
+    """Copy a module with other objects under some names; the module itself stays as it is.
 
     ``replace_in(Net, torch=replaced(torch, load=lambda *_: {}))`` lets one module load nothing.
     """
@@ -60,7 +60,7 @@ def replaced(module: ModuleType, **attributes: Any) -> ModuleType:
 
 
 class Untrained:
-    """A module, such as ``torchvision.models``, whose functions ignore ``pretrained=True``."""
+    """Makes functions of a module, such as ``torchvision.models``, ignore ``pretrained=True``."""
 
     def __init__(self, module: ModuleType) -> None:
         self._module = module

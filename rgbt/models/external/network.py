@@ -39,7 +39,7 @@ FEEDS: Mapping[Feed, Callable[..., tuple[Any, ...]]] = {
     "pair": lambda rgb, thermal: (rgb, thermal),
     "pair_and_edges": lambda rgb, thermal, edges: (rgb, thermal, edges[:, 0]),
     "list": lambda rgb, thermal: ([rgb, thermal],),
-    "dicts": lambda rgb, thermal: ([{"image": each} for each in torch.cat([rgb, thermal], 1)],),
+    "dicts": lambda rgb, thermal: ([{"image": both} for both in torch.cat([rgb, thermal], 1)],),
     "thermal": lambda _, thermal: (thermal,),
 }
 
@@ -56,7 +56,7 @@ _numpy = np.random.mtrand._rand  # NumPy's global generator
 
 
 class Namespace(dict[str, Any]):
-    """Settings that can be read as attributes and as keys, as many configurations are."""
+    """Holds settings that can be read as attributes and as keys, as many configurations are."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         nested = {k: Namespace(v) if isinstance(v, Mapping) else v for k, v in values.items()}
@@ -69,7 +69,7 @@ class Namespace(dict[str, Any]):
 
 
 class ExternalNetwork(nn.Module):
-    """A network that is built from its author's checkout, whose code is executed.
+    """Calls a network that is built from its author's checkout, whose code is executed.
 
     What it draws at random comes from the generator of the step, in evaluation from a fixed seed.
     The arguments are the keys of ``conf/model/external.yaml``.
@@ -112,7 +112,7 @@ class ExternalNetwork(nn.Module):
         folder = (whole / root).resolve()
         if not folder.is_relative_to(whole):  # the user trusts `checkout`
             raise InputError(f"model.root={root} leads out of model.checkout={checkout}.")
-        spaces = {key: Namespace(each) for key, each in namespaces.items()}
+        spaces = {key: Namespace(values) for key, values in namespaces.items()}
         self.network = build(folder, constructor, arguments | spaces)
 
     def forward(
@@ -124,27 +124,29 @@ class ExternalNetwork(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Class scores as `rgbt.models` says; in training `aux["aux_logits"]` if `auxiliary`."""
+        """Predict scores as `rgbt.models` says; in training `aux["aux_logits"]` if `auxiliary`."""
         only_view(views, self.record.views, self.constructor)
         maps = [*self.inputs(rgb, thermal, masks, multiple=self.multiple)]
         if self.feed == "pair_and_edges":
             maps.append(padded(edge_map(rgb, thermal), self.multiple))
         if self.size_hw is not None:
-            maps = [_resized(each, self.size_hw) for each in maps]
+            maps = [_resized(image, self.size_hw) for image in maps]
         seed = 0  # two evaluations agree
         if self.training:
             assert generator is not None, "a network in training gets the generator of the step"
             drawn = torch.randint(2**31, (), generator=generator, device=generator.device)
             seed = int(drawn) ^ rank()
-        calls = zip(*(each.split(1) for each in maps), strict=True) if self.one_by_one else [maps]
+        calls: list[list[Tensor]] = [maps]
+        if self.one_by_one:
+            calls = [[image[n : n + 1] for image in maps] for n in range(len(rgb))]
         with seeded(seed, rgb.device):
-            parts = [self._called(*each) for each in calls]
-        found = (torch.cat(each) for each in zip(*parts, strict=True))
-        logits, *auxiliary = (self._at_input(each, maps[0], rgb) for each in found)
+            parts = [self._called(*call) for call in calls]
+        found = [torch.cat(scores) for scores in zip(*parts, strict=True)]
+        logits, *auxiliary = [self._at_input(scores, maps[0], rgb) for scores in found]
         return Output(logits, {"aux_logits": auxiliary[0]} if auxiliary else {})
 
     def _called(self, *maps: Tensor) -> list[Tensor]:
-        """The scores, and in training the auxiliary ones, at the size that the network returns."""
+        """Return scores, and in training auxiliary ones, at the size that the network returns."""
         output = self.network(*FEEDS[self.feed](*maps))
         shape = maps[0].shape[0], self.num_classes
         name = "train_scores" if self.training else "scores"
@@ -154,7 +156,7 @@ class ExternalNetwork(nn.Module):
         return found
 
     def _at_input(self, scores: Tensor, called: Tensor, images: Tensor) -> Tensor:
-        """Scores at the size of the images, as float32."""
+        """Resize scores to the images, as float32."""
         scores = scores.float()
         called_hw, hw = called.shape[2:], images.shape[2:]
         if scores.shape[2:] != called_hw and not self.resize:
@@ -170,7 +172,7 @@ class ExternalNetwork(nn.Module):
 
 
 def _resized(maps: Tensor, hw: tuple[int, ...]) -> Tensor:
-    """(N, C, H, W) at another size, bilinear."""
+    """Resize (N, C, H, W), bilinear."""
     return F.interpolate(maps, size=tuple(hw), mode="bilinear", align_corners=False)
 
 
@@ -179,7 +181,7 @@ def _resized(maps: Tensor, hw: tuple[int, ...]) -> Tensor:
 
 @contextmanager
 def seeded(seed: int, device: torch.device) -> Iterator[None]:
-    """A context in which the global generators begin at `seed`; then they are as before.
+    """Begin the global generators at `seed` in a context; then they are as before.
 
     Those of Python, NumPy, torch on the CPU and torch on `device`; `seed` from 0 to 2^32 - 1.
     """
@@ -196,7 +198,7 @@ def seeded(seed: int, device: torch.device) -> Iterator[None]:
 
 
 def build(folder: Path, constructor: str, arguments: Mapping[str, Any]) -> nn.Module:
-    """The network on the CPU, with the random weights that the global generator of torch gives.
+    """Build the network on the CPU, with weights drawn from the global generator of torch.
 
     `folder` is put on the path of modules; the constructor is "module:name" of the checkout, or
     "file.py:name" of an adapter. InputError: it cannot be imported or built.
@@ -231,7 +233,7 @@ def build(folder: Path, constructor: str, arguments: Mapping[str, Any]) -> nn.Mo
 
 
 def author_line(error: BaseException) -> str:
-    """Where code of the checkout raised an error, ", /code/net.py line 3"; "": elsewhere."""
+    """Say where code of the checkout raised an error, ", /code/net.py line 3"; "": elsewhere."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if any(Path(frame.filename).is_relative_to(folder) for folder in _held):
             return f", {frame.filename} line {frame.lineno}"
@@ -239,7 +241,7 @@ def author_line(error: BaseException) -> str:
 
 
 def _function(folder: Path, constructor: str) -> Callable[..., Any]:
-    """The class or function that builds the network."""
+    """Import the class or function that builds the network."""
     name, _, attribute = constructor.partition(":")
     adapter = adapter_of(constructor)
     if adapter is not None:
@@ -262,7 +264,7 @@ def _function(folder: Path, constructor: str) -> Callable[..., Any]:
 
 
 def edge_map(rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Edges of both images, as EGFNet writes them to files: (N, 1, H, W), whole, 0..255.
+    """Compute edges of both images, as EGFNet writes them to files: (N, 1, H, W), whole, 0..255.
 
         E = (e(Y) + e(T)) mod 256, e(X) = round((|dx X| + |dy X|) / 2), slopes at most 255
 
@@ -279,10 +281,10 @@ def edge_map(rgb: Tensor, thermal: Tensor) -> Tensor:
 
 
 def picked(output: Any, path: ScorePath) -> Any:
-    """What a path leads to; None where it leads nowhere."""
+    """Return what a path leads to; None where it leads nowhere."""
     for number, step in enumerate(path):
         if step == "*":
-            return torch.stack([picked(each, path[number + 1 :]) for each in output])
+            return torch.stack([picked(element, path[number + 1 :]) for element in output])
         try:
             output = output[step]
         except (TypeError, IndexError, KeyError):
@@ -291,7 +293,7 @@ def picked(output: Any, path: ScorePath) -> Any:
 
 
 def scores_at(output: Any, paths: ScorePaths, setting: str, shape: tuple[int, int]) -> Tensor:
-    """The sum of the scores at some paths, (N, K, h, w), of the expected `shape` (N, K).
+    """Add the scores at some paths, (N, K, h, w), of the expected `shape` (N, K).
 
     InputError, with the key that has the paths: one leads to something else than such scores.
     """
@@ -308,7 +310,7 @@ def scores_at(output: Any, paths: ScorePaths, setting: str, shape: tuple[int, in
 
 
 def structure(value: object) -> str:
-    """What a network returned, in words: "tuple (Tensor (2, 9, 4, 6) float32, list (int 1))"."""
+    """Describe what a network returned: "tuple (Tensor (2, 9, 4, 6) float32, list (int 1))"."""
     if not isinstance(value, tuple | list):
         return described(value)
     return f"{type(value).__name__} ({', '.join(map(structure, value))})"

@@ -8,8 +8,9 @@ Shape letters beside those of `rgbt.types`: `S` tokens of all levels together, `
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -26,7 +27,7 @@ Levels = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class HeadShape:
-    """Sizes of both decoders; keys of ``conf/model/mask2former.yaml``."""
+    """Holds the sizes of both decoders, keys of ``conf/model/mask2former.yaml``."""
 
     num_classes: int
     hidden_dim: int
@@ -40,7 +41,7 @@ class HeadShape:
 
 
 class PixelPyramid(NamedTuple):
-    """The output of the pixel decoder.
+    """Holds the output of the pixel decoder.
 
     Mask features are W f + b with the last 1 x 1 convolution (W, b). They are handed on as the
     three factors: e (W f + b) = (e W) f + e b costs less, for fewer embeddings e than pixels.
@@ -56,7 +57,7 @@ class PixelPyramid(NamedTuple):
 
 @lru_cache(maxsize=64)
 def centre_grid(levels: Levels, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Centre of every token of all levels, and length of a pixel, as `grid_sample` counts.
+    """Return the centre of every token of all levels and the length of a pixel for `grid_sample`.
 
         (x, y) = 2 (column + 1/2) / columns - 1,  2 (row + 1/2) / rows - 1;  2 / columns, 2 / rows
 
@@ -74,7 +75,7 @@ def centre_grid(levels: Levels, device: torch.device) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=64)
 def sine_code(hw: tuple[int, int], dim: int, device: torch.device) -> Tensor:
-    """Position code of every token of a map: first half of the channels y, second half x.
+    """Return the position code of every token of a map: half of the channels y, then x.
 
         angle(p, k) = 2 pi p / (P + 1e-6) / 10000^(2 floor(k / 2) / (dim / 2)),  p = 1..P
         code(p, k) = sin(angle) for even k, cos(angle) for odd k
@@ -96,7 +97,7 @@ def sine_code(hw: tuple[int, int], dim: int, device: torch.device) -> Tensor:
 
 
 class DeformableAttention(nn.Module):
-    """Every token averages a few bilinear samples of each level, at predicted positions.
+    """Averages for every token a few bilinear samples of each level, at predicted positions.
 
         out_q = W_o sum_j a_qj  value(reference_q + offset_qj),   sum_j a_qj = 1 per head
 
@@ -146,19 +147,22 @@ class DeformableAttention(nn.Module):
             maps = value_l.view(*value_l.shape[:2], *hw)
             sampled = F.grid_sample(maps, grid.transpose(2, 3), align_corners=False)
             parts.append((sampled * weight_l[:, None]).sum(2))
-        total = reduce(torch.add, parts).view(batch, dim, length)
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        total = total.view(batch, dim, length)
         return _project(self.output_proj, total).transpose(1, 2)
 
 
 def _project(layer: nn.Linear, x: Tensor) -> Tensor:
-    """(B, C, S) -> (B, C', S): the layer on channels that come before the tokens."""
+    """Apply a layer to channels that come before the tokens: (B, C, S) -> (B, C', S)."""
     batch, _, length = x.shape
     bias = layer.bias[:, None].expand(batch, -1, length)
     return torch.baddbmm(bias, layer.weight.expand(batch, -1, -1), x)
 
 
 class EncoderLayer(nn.Module):
-    """Deformable self-attention and feed-forward network, each added and then normalised."""
+    """Adds deformable self-attention, then a feed-forward network; normalises after each."""
 
     def __init__(self, shape: HeadShape) -> None:
         super().__init__()
@@ -178,7 +182,7 @@ class EncoderLayer(nn.Module):
 
 
 class LevelEncoder(nn.Module):
-    """Encoder layers over the tokens of all levels."""
+    """Applies encoder layers to the tokens of all levels."""
 
     def __init__(self, shape: HeadShape) -> None:
         super().__init__()
@@ -197,7 +201,7 @@ class LevelEncoder(nn.Module):
 
 
 class ConvNorm(nn.Conv2d):
-    """Convolution without bias, then group normalisation, under the released names."""
+    """Convolves without bias and normalises groups of channels, under the released names."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
         super().__init__(in_channels, out_channels, kernel, padding=kernel // 2, bias=False)
@@ -210,7 +214,7 @@ class ConvNorm(nn.Conv2d):
 
 
 class PixelDecoder(nn.Module):
-    """Features of four strides, of `widths` channels, to mask features and three levels of tokens.
+    """Computes mask features and three levels of tokens from four maps of `widths` channels.
 
     Source: Mask2Former, Sec. 3.2 and 4.1; MSDeformAttn variant of its release.
     """
@@ -234,7 +238,7 @@ class PixelDecoder(nn.Module):
             nn.init.zeros_(convolution.get_parameter("bias"))
 
     def forward(self, features: list[Tensor], num_masks: int) -> PixelPyramid:
-        """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens.
+        """Compute mask features and tokens of features (B, C_s, H/s, W/s), s = 4, 8, 16, 32.
 
         Only the first `num_masks` samples have masks. No gradient is computed of the mask features
         of the others.
@@ -242,7 +246,7 @@ class PixelDecoder(nn.Module):
         if not self.fp32:
             return self._decode(features, num_masks)
         with torch.autocast(features[0].device.type, enabled=False):
-            return self._decode([each.float() for each in features], num_masks)
+            return self._decode([x.float() for x in features], num_masks)
 
     def _decode(self, features: list[Tensor], num_masks: int) -> PixelPyramid:
         fine, *coarse = features
@@ -264,7 +268,7 @@ class PixelDecoder(nn.Module):
         return PixelPyramid(finest, reduced, weight.flatten(1), bias, per_level, levels)
 
     def _finest(self, fine: Tensor, stride_8: Tensor) -> Tensor:
-        """The backbone's map at stride 4 and the enlarged one of stride 8: (M, C, H/4, W/4)."""
+        """Add the enlarged map of stride 8 to the backbone's map at stride 4: (M, C, H/4, W/4)."""
         upsampled = F.interpolate(
             stride_8, size=fine.shape[-2:], mode="bilinear", align_corners=False
         )
@@ -274,7 +278,7 @@ class PixelDecoder(nn.Module):
 
 
 def shrink(x: Tensor, factor: int) -> Tensor:
-    """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
+    """Resize by an even factor, bilinear: the mean of the four pixels around each new centre.
 
     Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU; (..., H, W) ->
     (..., H / factor, W / factor).
@@ -288,7 +292,7 @@ def shrink(x: Tensor, factor: int) -> Tensor:
 
 
 class QueryAttention(nn.Module):
-    """`torch.nn.MultiheadAttention` that takes one mask for all heads without repeating it."""
+    """Attends as `torch.nn.MultiheadAttention`, with one mask for all heads, not repeated."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -318,7 +322,7 @@ class QueryAttention(nn.Module):
 
 
 class AttentionLayer(nn.Module):
-    """Queries read one level, or each other; added, then normalised."""
+    """Adds to queries what they read of one level, or of each other, and normalises them."""
 
     def __init__(self, name: str, dim: int, heads: int) -> None:
         super().__init__()
@@ -334,7 +338,7 @@ class AttentionLayer(nn.Module):
 
 
 class FfnLayer(nn.Module):
-    """Linear, ReLU, linear; added, then normalised."""
+    """Adds to queries a feed-forward network of them, and normalises them."""
 
     def __init__(self, dim: int, ffn_dim: int) -> None:
         super().__init__()
@@ -349,21 +353,21 @@ class FfnLayer(nn.Module):
         return self.norm(queries + self.linear2(F.relu(self.linear1(queries))))
 
 
-class MaskEmbed(nn.Module):
-    """Three linear layers with ReLU between them: query -> mask embedding."""
+def mask_embed(dim: int) -> nn.Sequential:
+    """Make three linear layers with ReLU between them: query (..., C) -> mask embedding (..., C).
 
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList(nn.Linear(dim, dim) for _ in range(3))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, Q, C) -> (B, Q, C)."""
-        first, second, third = self.layers
-        return third(F.relu(second(F.relu(first(x)))))
+    The released numbers count the linear layers alone.
+    """
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    for number in range(3):
+        if number:
+            layers[f"relu{number}"] = nn.ReLU()
+        layers[str(number)] = nn.Linear(dim, dim)
+    return nn.Sequential(OrderedDict(layers=nn.Sequential(layers)))
 
 
 class Predictor(nn.Module):
-    """Query decoder with a prediction before the first and after every layer.
+    """Decodes queries, with a prediction before the first and after every layer.
 
     Layer i reads level i mod 3 (strides 32, 16, 8).   Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).
     """
@@ -385,10 +389,10 @@ class Predictor(nn.Module):
         self.query_embed = nn.Embedding(shape.num_queries, dim)
         self.level_embed = nn.Embedding(NUM_LEVELS, dim)
         self.class_embed = nn.Linear(dim, shape.num_classes + 1)
-        self.mask_embed = MaskEmbed(dim)
+        self.mask_embed = mask_embed(dim)
 
     def forward(self, pyramid: PixelPyramid) -> tuple[Tensor, Tensor]:
-        """Predictions of the initial queries and after each layer, L in all, the last one final.
+        """Predict from the initial queries and after each layer, L times, the last one final.
 
         Class logits (L, B, Q, K + 1), last column = no object, and mask logits (L, M, Q, H/4, W/4)
         of the M samples of `PixelPyramid.fine`, a view of memory ordered M, L, Q, H/4, W/4.
@@ -430,6 +434,6 @@ class Predictor(nn.Module):
 
 
 def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:
-    """(B, Q, C) mask embeddings times mask features of `fine` (B, C, pixels) -> (B, Q, pixels)."""
+    """Multiply mask embeddings (B, Q, C) by the mask features of `fine`: (B, Q, pixels)."""
     offset = embed @ pyramid.bias[:, None]
     return torch.baddbmm(offset.expand(-1, -1, fine.shape[-1]), embed @ pyramid.weight, fine)

@@ -26,10 +26,10 @@ from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBel
 
 
 class RgbtBackbone(nn.Module):
-    """RGB branch, thermal branch, and their fusion.   Source: CRM, Sec. III-B.
+    """Computes maps of both images by a Swin branch each; the fusion is here too.
 
     Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding and
-    output normalisations never are.
+    output normalisations never are.   Source: CRM, Sec. III-B.
     """
 
     token_px = PATCH
@@ -45,8 +45,11 @@ class RgbtBackbone(nn.Module):
     ) -> None:
         super().__init__()
         self.RGB_branch = Swin(3, shape=shape, shared={})
-        stages = {i: s for i, s in enumerate(self.RGB_branch.layers) if isinstance(s, Stage)}
-        shared = {index: stage for index, stage in stages.items() if index >= share_start}
+        shared: dict[int, Stage] = {}
+        for index, stage in enumerate(self.RGB_branch.layers):
+            assert isinstance(stage, Stage), "a branch has stages alone"
+            if index >= share_start:
+                shared[index] = stage
         self.THR_branch = Swin(thermal_channels, shape=shape, shared=shared)
         if mask_token == "shared":
             self.THR_branch.mask_token = self.RGB_branch.mask_token
@@ -55,13 +58,13 @@ class RgbtBackbone(nn.Module):
     def maps(
         self, modality: str, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
     ) -> Maps:
-        """(N, c, H, W) with sides that are multiples of 32, and (N, H / 4, W / 4)."""
+        """Return maps of (N, c, H, W), sides multiples of 32, hidden tokens (N, H / 4, W / 4)."""
         branch = self.RGB_branch if modality == "rgb" else self.THR_branch
         return branch(image, hidden, generator)
 
 
 class Mask2Former(MaskNetwork):
-    """Two-branch Mask2Former of CRM and SpatialSeg.
+    """Predicts from both images by the two-branch Mask2Former of CRM and SpatialSeg.
 
     Parameter names are those of the released checkpoints without their leading `network.`.
 

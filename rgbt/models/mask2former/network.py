@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval, MultipleOf
@@ -44,16 +44,8 @@ Widths = tuple[int, int, int, int]
 Maps = list[Tensor]
 
 
-class Request(NamedTuple):
-    """The first `predictions` of all `views` of all `passes`; see `MaskNetwork.forward`."""
-
-    views: tuple[View, ...]
-    passes: int
-    predictions: int
-
-
 class Fusion(nn.ModuleDict):
-    """The normalised maximum (or sum) of the maps of both modalities, level by level.
+    """Takes the normalised maximum (or sum) of the maps of both modalities, level by level.
 
     Source: CRM, Sec. III-B.   Released: the maps of a single modality are not normalised again.
     """
@@ -65,36 +57,42 @@ class Fusion(nn.ModuleDict):
         self.widths = widths
         self.fuse = torch.maximum if fusion == "max" else torch.add
 
-    def forward(self, maps: dict[str, Maps], request: Request) -> Maps:
-        """Maps of "rgb" and "thermal" to those of all predictions: pass by pass, view by view.
+    def forward(
+        self, maps: dict[str, Maps], views: tuple[View, ...], passes: int, predictions: int
+    ) -> Maps:
+        """Return the maps of the first `predictions`, pass by pass, and within it view by view.
 
-        Batch normalisation takes the passes one after the other, each on its own.
+        `maps` are those of "rgb" and "thermal" of all `passes`; see `MaskNetwork.forward`. Batch
+        normalisation takes the passes one after the other.
         """
         predicted = []
         for level, norm in enumerate(self.values()):
             by_view: list[Sequence[Tensor]] = []
-            for view in request.views:
+            for view in views:
                 if view != "rgbt":
-                    by_view.append(_parts(maps[view][level], request.passes))
+                    by_view.append(_parts(maps[view][level], passes))
                     continue
                 fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
                 if self.training:
-                    by_view.append([norm(part) for part in _parts(fused, request.passes)])
+                    by_view.append([norm(part) for part in _parts(fused, passes)])
                 else:  # without batch statistics all passes are one call
-                    by_view.append(_parts(norm(fused), request.passes))
+                    by_view.append(_parts(norm(fused), passes))
             parts = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
-            parts = parts[: request.predictions]
+            parts = parts[:predictions]
             predicted.append(torch.cat(parts) if len(parts) > 1 else parts[0])
         return predicted
 
 
 def _parts(stacked: Tensor, passes: int) -> Sequence[Tensor]:
-    """The passes of a stacked batch; one alone is not split, so that its size may be a symbol."""
+    """Split a stacked batch into its passes.
+
+    One alone is not split: in an exported graph its size may be a symbol.
+    """
     return (stacked,) if passes == 1 else stacked.chunk(passes)
 
 
 class MaskNetwork(nn.Module):
-    """Two images through a backbone to classes and masks of queries.
+    """Predicts classes and masks of queries from two images by a backbone.
 
     Source: Mask2Former, Sec. 3.2.
 
@@ -128,7 +126,7 @@ class MaskNetwork(nn.Module):
         num_masks: int | None = None,
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Predictions of every view and pass, as one batch through the head.
+        """Predict from every view and pass, as one batch through the head.
 
         Predictions are in the order F R T F' R' T': pass by pass, within it view by view. Images
         and masks are as `rgbt.models` says, N = passes * B, pass by pass. A cell is a square of a
@@ -171,7 +169,7 @@ class MaskNetwork(nn.Module):
             if views != (MODALITIES[1 - index],):
                 mask = None if hidden is None else hidden[index]
                 maps[modality] = self.backbone.maps(modality, images[index], mask, generator)
-        features = self.backbone.norm_layers(maps, Request(views, passes, predictions))
+        features = self.backbone.norm_layers(maps, views, passes, predictions)
         pyramid = self.sem_seg_head["pixel_decoder"](features, with_masks * count)
         class_logits, mask_logits = self.sem_seg_head["predictor"](pyramid)
         logits = None
@@ -184,7 +182,7 @@ class MaskNetwork(nn.Module):
         return Output(logits, aux)
 
     def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
-        """Class scores (B, K, H, W) float32 of an output of one pass and view, in training.
+        """Return class scores (B, K, H, W) float32 of an output of one pass and view, in training.
 
         They are logarithms of the semantic scores, whose softmax is the share of a class.
         """
@@ -196,7 +194,7 @@ class MaskNetwork(nn.Module):
 def semantic_logits(
     class_logits: Tensor, mask_logits: Tensor, image_hw: tuple[int, int], padded: tuple[int, int]
 ) -> Tensor:
-    """Score of every class at every pixel, at the size of the image.
+    """Return the score of every class at every pixel, at the size of the image.
 
         score(k, pixel) = sum over queries of softmax(class)(k) * sigmoid(mask)(pixel)
 

@@ -36,7 +36,7 @@ NAMESPACE = f"""{HEAD}
 class Net(Base):
     def __init__(self, cfg=None, norm_layer=nn.BatchNorm2d):
         super().__init__(cfg.num_classes if "num_classes" in cfg else cfg["k"])
-        self.names = [each for each in cfg.modals], cfg.deep.eps
+        self.names = [modal for modal in cfg.modals], cfg.deep.eps
 """
 
 
@@ -175,7 +175,7 @@ LIST = PAIR.replace("def forward(self, rgb, thermal):", "def forward(self, x):")
 DICTS = f"""{HEAD}
 class Net(Base):
     def forward(self, batched):
-        return [{{"sem_seg": self.conv(each["image"])}} for each in batched]
+        return [{{"sem_seg": self.conv(image["image"])}} for image in batched]
 """
 THERMAL = STACKED.replace("channels=4", "channels=1")
 EDGES = f"""{HEAD}
@@ -219,9 +219,9 @@ def test_edge_map_is_that_of_opencv() -> None:
     rng = np.random.default_rng(0)
     grey, thermal = rng.integers(0, 256, (2, 9, 11), dtype=np.uint8)
     halves = []
-    for each in (grey, thermal):
+    for image in (grey, thermal):
         across, down = (
-            cv2.convertScaleAbs(cv2.Sobel(each, cv2.CV_16S, *order)) for order in ((1, 0), (0, 1))
+            cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, *order)) for order in ((1, 0), (0, 1))
         )
         halves.append(cv2.addWeighted(across, 0.5, down, 0.5, 0))
     rgb = torch.tensor(grey / 255).expand(1, 3, 9, 11)
@@ -264,7 +264,7 @@ def test_forward_scores_every_pixel_also_of_odd_sides(tmp_path: Path) -> None:
         assert (out.logits.shape, out.aux) == ((2, 3, 9, 13), {})
         assert out.logits.dtype == torch.float32
     exported = exported_network(net.eval(), "rgbt", (9, 13), "strided")
-    torch.testing.assert_close(*(each(*images(2, 9, 13)).logits for each in (exported, net)))
+    torch.testing.assert_close(*(model(*images(2, 9, 13)).logits for model in (exported, net)))
     with pytest.raises(InputError, match=r"model\.scores: .* scores of \(3, 4\) .* \(12, 16\)"):
         external(folder, multiple=4).eval()(*images(2, 9, 13))
 
@@ -320,7 +320,7 @@ def test_training_may_read_other_scores(tmp_path: Path) -> None:
     torch.testing.assert_close(trained.aux["aux_logits"], evaluated.logits)
     record = record_of(net, NetworkRecord)
     assert record.auxiliary
-    assert [(each.node, each.key) for each in record.requires] == [("loss", "reads_auxiliary")]
+    assert [(need.node, need.key) for need in record.requires] == [("loss", "reads_auxiliary")]
 
 
 @pytest.mark.parametrize("names", ["{}", "module.{}", "net.{}", "network.{}"])
