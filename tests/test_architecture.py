@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -177,3 +178,36 @@ def deep_functions(path: Path) -> Iterator[str]:
 @pytest.mark.parametrize("broken", [forbidden_imports, global_draws, deep_functions])
 def test_every_file_keeps_the_rule(broken: Callable[[Path], Iterator[str]]) -> None:
     assert [f"{path} {what}" for path in FILES for what in broken(path)] == []
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.with_suffix("").parts)
+
+
+def arrows() -> dict[str, set[str]]:
+    """Module -> modules it imports: at the top, in functions, and for types alone."""
+    modules = {module_of(path) for path in FILES if path.name != "__init__.py"}
+    found: dict[str, set[str]] = {}
+    for path in FILES:
+        names = {name for full in imported(path) for name in (full, full.rpartition(".")[0])}
+        found[module_of(path)] = (names & modules) - {module_of(path)}
+    return found
+
+
+def circle_in(imports: dict[str, set[str]]) -> list[str]:
+    """One circle of imports, its first module named again at its end; [] where there is none."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    assert circle_in(arrows()) == []
+
+
+def test_circle_is_found() -> None:
+    found = circle_in({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()})
+    assert sorted(set(found)) == ["b", "c"]
+    assert "rgbt.config.command" in arrows()["rgbt.run"]  # at the top, and in a function
