@@ -1,5 +1,6 @@
-"""Tables, grids and searches: unfinished runs are executed, each in a separate process.
+"""Many runs: grids, searches and tables, with the claims of papers and the pages made of them.
 
-``rgbt reproduce table=spatialseg/table3`` and ``rgbt run -m ...`` use one mechanism: trials of an
-Optuna study (`worker.trial_store`), executed by any number of drivers (`worker.driver`).
+The rooms are read in one order, and each imports those before it only: `plan` (what was asked, as
+points with keys and tags), `run` (one driver a study, executors), `score` (columns, measurements,
+cells), `judge` (verdicts), `show` (terminal, pages). The modules beside them are commands.
 """

@@ -76,41 +76,32 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
 
     from analysis.results import finished_runs
     from sweeps.judge.judged_table import JudgedTable
-    from sweeps.judge.reader import RunReader
     from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
-    from sweeps.plan.request import (
-        TableRequest,
-        check_equal_runs,
-        check_override,
-        make_request,
-        read_named,
-    )
-    from sweeps.plan.table import is_own, table_names
+    from sweeps.plan.request import TableRequest, check_override, make_request, read_named
+    from sweeps.plan.table import table_names
     from sweeps.score.efficiency import network_sizes
+    from sweeps.score.reader import RunReader
 
     names = table_names(Path("none"))
     if options.table != ALL:
         names = split_list(options.table, "tables")
-    reader = RunReader(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
+    reader = RunReader(finished_runs(options.runs_dir, options.archive))
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
-    for typed in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(typed)
+    for named in track(names, "judging", console=Console(stderr=True), transient=True):
+        name, table = read_named(named)
         if not table.claims:
             continue
-        request = make_request(
-            TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
-        )
+        typed = TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
+        request = make_request(typed, planner=planner)
         for row in request.external:
             raise InputError(
                 f"{row.kind}.{row.label}: only finished runs are judged here; "
                 f"use rgbt reproduce table={name} for rows that are not trained."
             )
-        if overrides or is_own(typed):  # a test checks the others
-            check_equal_runs(request, planner)
         runs = runs_of_request(request, reader, planner, checked=bool(overrides))
         sizes = network_sizes(request)
         judged += JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader).claims

@@ -124,13 +124,11 @@ def request_of(options: Options, name: str, words: Sequence[str], planner: Plann
     from sweeps.judge.until_decided import START
     from sweeps.plan.request import (
         TableRequest,
-        check_equal_runs,
         make_request,
         read_named,
         row_digests,
         seeds_of,
     )
-    from sweeps.plan.table import is_own
 
     adds, both = options.seeds == "until_decided", options.form == "both"
     typed = TableRequest(
@@ -141,9 +139,7 @@ def request_of(options: Options, name: str, words: Sequence[str], planner: Plann
         form="released" if options.form == "released" else "paper",
         until_decided=adds,
     )
-    request = make_request(typed, options.rows, both=both)
-    if words or is_own(name):  # a test checks the others
-        check_equal_runs(request, planner)
+    request = make_request(typed, options.rows, both=both, planner=planner)
     if request.deciding_words():
         request = replace(request, digests=row_digests(request, planner))
     if adds and not request.table.claims:

@@ -26,23 +26,8 @@ NOISE: dict[str, Noise] = {TRAINED: "cells", TESTED: "effects"}
 # Name of the line that is no effect: the outcome itself.
 MEAN = "mean of all cells"
 
-COLUMNS = (
-    "part",
-    "outcome",
-    "method",
-    "against",
-    "effect",
-    "value",
-    "low",
-    "high",
-    "p",
-    "p_holm",
-    "shown",
-    "error_seeds",
-    "error_images",
-    "seeds",
-    "cells",
-)
+COLUMNS = ["part", "outcome", "method", "against", "effect", "value", "low", "high", "p"]
+COLUMNS += ["p_holm", "shown", "error_seeds", "error_images", "seeds", "cells"]
 
 
 def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
@@ -60,7 +45,7 @@ def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
     lacking: list[str] = []
     design = judged.request.table.design
     if design is None:
-        return pd.DataFrame(columns=list(COLUMNS)), []
+        return pd.DataFrame(columns=COLUMNS), []
     labels = {row.label for row in judged.request.table.rows}
     for part, outcome, method in product(design.parts, design.outcomes, design.methods):
         if labels.isdisjoint(row for row, _ in design.places(part, method.name)):
@@ -81,7 +66,7 @@ def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
         except InputError:  # its missing runs are named with that method
             continue
         rows += _lines({**start, "against": method.against}, design, differences)
-    return pd.DataFrame(rows, columns=list(COLUMNS)), list(dict.fromkeys(lacking))
+    return pd.DataFrame(rows, columns=COLUMNS), list(dict.fromkeys(lacking))
 
 
 def _cells(

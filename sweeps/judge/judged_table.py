@@ -30,12 +30,12 @@ from sweeps.judge.contrasts import (
     effects_claimed,
     printed_values,
 )
-from sweeps.judge.reader import RunReader
 from sweeps.plan.claim import HIGHER, LOWER, Claim
 from sweeps.plan.request import UNTIL_DECIDED, RowSeed, TableRequest
 from sweeps.plan.table import Column, is_counted, metric_of, words_of, world_words
 from sweeps.point import Outcome
 from sweeps.score.cells import CellId, ScoredTable, TableCell, score, size_marks
+from sweeps.score.reader import RunReader
 
 # Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000
@@ -149,16 +149,8 @@ class JudgedTable:
     def terms(self, cells: Sequence[Cell]) -> list[Term]:
         """Return the scores of counts, by seed, that a weighted sum of cells is made of.
 
-        InputError: a row has no finished run or not the score, or the rows are the same runs.
+        InputError: a row has no finished run or not the score.
         """
-        terms = self._terms(cells)
-        if _are_same(terms):
-            rows = " and ".join(dict.fromkeys(f"'{cell.row}'" for cell in cells))
-            raise InputError(f"rows {rows} are the same runs at this scale.")
-        return terms
-
-    def _terms(self, cells: Sequence[Cell]) -> list[Term]:
-        """The `terms` of rows that may be the same runs."""
         terms = []
         for cell in cells:
             terms += self._cell_terms(cell)
@@ -274,10 +266,14 @@ class JudgedTable:
         )
 
     def _evidence(self, contrasts: Sequence[Contrast], alike: Alike) -> Evidence:
-        """The evidence about the mean of contrasts."""
+        """The evidence about the mean of contrasts; InputError: `terms`, or rows of equal runs."""
         terms = []
         for contrast in contrasts:
-            for term in self.terms(contrast.cells):
+            of_contrast = self.terms(contrast.cells)
+            if _are_same(of_contrast):
+                rows = " and ".join(dict.fromkeys(f"'{cell.row}'" for cell in contrast.cells))
+                raise InputError(f"rows {rows} are the same runs at this scale.")
+            for term in of_contrast:
                 terms.append(replace(term, weight=term.weight / len(contrasts)))
         return self.resampler(alike).evidence(terms)
 
@@ -344,7 +340,7 @@ class JudgedTable:
         # The nearest row first: if it cannot be told apart, the others need no interval.
         for label in sorted(others, key=lambda other: abs(means[other] - means[best])):
             try:
-                terms = self._terms(difference(best, label, column.name).cells)
+                terms = self.terms(difference(best, label, column.name).cells)
                 if _are_same(terms):
                     same.append(label)
                     continue

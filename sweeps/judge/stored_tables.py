@@ -12,12 +12,12 @@ from rgbt.config.compose import available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
 from sweeps.judge.judged_table import RESAMPLES, JudgedTable
-from sweeps.judge.reader import ODD, SEED, RunReader
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, RowSeed, TableRequest
 from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
 from sweeps.point import Outcome, Point
 from sweeps.score.efficiency import network_sizes
+from sweeps.score.reader import ODD, SEED, RunReader
 
 # How a table was run: scale, form, and the words that were typed for every row.
 Variant = tuple[str, Form, tuple[str, ...]]

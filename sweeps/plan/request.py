@@ -28,6 +28,7 @@ from sweeps.plan.table import (
     is_counted,
     load_table,
     metric_of,
+    study_names,
     table_names,
     table_path,
     words_of,
@@ -210,11 +211,14 @@ class TableRequest:
         return " ".join([f"table/{self.name}", self.variant, *seeds])
 
 
-def make_request(request: TableRequest, rows: str = "", *, both: bool = False) -> TableRequest:
+def make_request(
+    request: TableRequest, rows: str = "", *, both: bool = False, planner: Planner | None = None
+) -> TableRequest:
     """Complete a request as it was typed, whose `extra` are all overrides.
 
     Its rows are selected (``rows=...``), `both` forms are compared, and the words
-    pretrained.NETWORK=FILE, weights.ROW=FILE and predictions.ROW=FOLDER are read.
+    pretrained.NETWORK=FILE, weights.ROW=FILE and predictions.ROW=FOLDER are read. With a `planner`,
+    rows that would be one run are refused; a test has compared those of the project as they are.
     """
     check_choice("scale", request.scale, available("scale"))
     table = select_rows(request.table, rows) if rows else request.table
@@ -242,6 +246,9 @@ def make_request(request: TableRequest, rows: str = "", *, both: bool = False) -
     for model in pretrained:
         what = f"{PRETRAINED}NETWORK of {request.name} at scale={request.scale}"
         check_choice(what, model, known - {""})
+    is_tested = request.name in (*table_names(Path("none")), *study_names())
+    if planner is not None and (made.typed_overrides() or made.external or not is_tested):
+        check_equal_runs(made, planner)
     return made
 
 

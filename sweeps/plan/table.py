@@ -429,11 +429,6 @@ def table_path(name: str, folder: Path = OWN) -> Path:
     return paths[0]
 
 
-def is_own(name: str) -> bool:
-    """Whether a table is one of the user, which no test of this project has checked."""
-    return not table_path(name).resolve().is_relative_to(PUBLISHED.parent)
-
-
 def load_table(name: str, folder: Path = OWN) -> Table:
     """Read and check a table (see `table_path`); InputError names its file and the wrong key."""
     path = table_path(name, folder)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from analysis.uncertainty.verdicts import Verdict
 from rgbt.tables import ABSENT, TextTable, csv_text
 from sweeps.judge.judged_table import JudgedClaim
 from sweeps.show.table import plain
@@ -25,36 +26,25 @@ NOTES = (
 # Word in the column of seeds for a difference of two evaluations without seeds.
 IMAGES = "images alone"
 
-COLUMNS = (
-    "table",
-    "paper",
-    "claim",
-    "source",
-    "says",
-    "remarks",
-    "verdict",
-    "contrast",
-    "printed",
-    "as_printed",
-    "margin",
-    "missing",
-    "reason",
-    "how",
-    "estimate",
-    "low",
-    "high",
-    "smallest",
-    "seeds_needed",
-    "seeds",
-    "starts",
-    "covers",
-    "warning",
-    "images",
-    "scale",
-    "start",
-)
+COLUMNS = ["table", "paper", "claim", "source", "says", "remarks", "verdict", "contrast"]
+COLUMNS += ["printed", "as_printed", "margin", "missing", "reason", "how", "estimate", "low"]
+COLUMNS += ["high", "smallest", "seeds_needed", "seeds", "starts", "covers", "warning", "images"]
+COLUMNS += ["scale", "start"]
 # Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
+
+
+# Numbers of a claim without a verdict.
+NO_VERDICT = Verdict(
+    kind="undecided",
+    estimate=math.nan,
+    interval=None,
+    covers="none",
+    smallest=math.nan,
+    seeds=0,
+    seeds_needed=math.nan,
+    decisive=0,
+)
 
 
 def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
@@ -69,15 +59,18 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows = []
-    for claim in judged:
-        rows.append({**_statement_columns(claim), "how": how, **_verdict_columns(claim)})
-    return pd.DataFrame(rows, columns=[*COLUMNS]).astype({"as_printed": object})
+    rows = [{**_columns_of(claim), "how": how} for claim in judged]
+    return pd.DataFrame(rows, columns=COLUMNS).astype({"as_printed": object})
 
 
-def _statement_columns(judged: JudgedClaim) -> dict[str, Any]:
-    claim = judged.claim
+def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
+    claim, verdict = judged.claim, judged.verdict or NO_VERDICT
     is_similar = claim.expected == "similar" and claim.at_most is not None
+    start = ""
+    if judged.scale:
+        is_one = judged.starts == 1 and verdict.seeds > 1
+        start = "one start for all seeds" if is_one else "a start for each seed"
+    warnings = [verdict.warning, *judged.warnings] if verdict.warning else judged.warnings
     return {
         "table": judged.table,
         "paper": judged.table.rpartition("/")[0] or "studies",
@@ -92,30 +85,14 @@ def _statement_columns(judged: JudgedClaim) -> dict[str, Any]:
         "margin": claim.at_most if is_similar else math.nan,
         "missing": " | ".join(judged.missing),
         "reason": judged.reason,
-    }
-
-
-def _verdict_columns(judged: JudgedClaim) -> dict[str, Any]:
-    verdict = judged.verdict
-    numbers = dict.fromkeys(("estimate", "low", "high", "smallest", "seeds_needed"), math.nan)
-    if verdict is None:
-        words = dict.fromkeys(("covers", "warning", "images", "scale", "start"), "")
-        return {**numbers, "seeds": 0, "starts": 0, **words}
-    numbers["estimate"] = verdict.estimate
-    numbers["smallest"] = verdict.smallest
-    numbers["seeds_needed"] = verdict.seeds_needed
-    if verdict.interval is not None:
-        numbers["low"], numbers["high"] = verdict.interval.low, verdict.interval.high
-    start = ""
-    if judged.scale:
-        is_one = judged.starts == 1 and verdict.seeds > 1
-        start = "one start for all seeds" if is_one else "a start for each seed"
-    warnings = [verdict.warning, *judged.warnings] if verdict.warning else judged.warnings
-    return {
-        **numbers,
+        "estimate": verdict.estimate,
+        "low": math.nan if verdict.interval is None else verdict.interval.low,
+        "high": math.nan if verdict.interval is None else verdict.interval.high,
+        "smallest": verdict.smallest,
+        "seeds_needed": verdict.seeds_needed,
         "seeds": verdict.seeds,
         "starts": min(verdict.seeds, judged.starts),
-        "covers": verdict.covers,
+        "covers": "" if judged.verdict is None else verdict.covers,
         "warning": " ".join(warnings),
         "images": judged.images,
         "scale": judged.scale,

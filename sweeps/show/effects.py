@@ -15,16 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-HEADER = (
-    "method",
-    "effect",
-    "difference",
-    "95 % interval",
-    "shown",
-    "of seeds",
-    "of images",
-    "seeds",
-)
+HEADER: tuple[str, ...] = ("method", "effect", "difference", "95 % interval", "shown")
+HEADER += ("of seeds", "of images", "seeds")
 ASKS = {
     TRAINED: "trained and tested in each cell",
     TESTED: "trained without any factor, tested in each cell",

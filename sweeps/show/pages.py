@@ -20,9 +20,9 @@ from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
-from sweeps.judge.reader import RunReader
 from sweeps.judge.stored_tables import judged_tables, known_tables
 from sweeps.plan.planner import Planner
+from sweeps.score.reader import RunReader
 from sweeps.show.claims import counts_grid, statement
 from sweeps.show.sections import (
     STUDIES,
@@ -139,10 +139,13 @@ class Report:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        own, of_papers = [], []
+        own = [table for table in self.tables if table.is_run]
+        of_papers = []
         for table in self.tables:
-            is_of_paper = table.page in self.texts["papers"] and not table.is_run
-            (of_papers if is_of_paper else own).append(table)
+            if not table.is_run and table.page in self.texts["papers"]:
+                of_papers.append(table)
+            elif not table.is_run and table.page != STUDIES:
+                own.append(table)
         data = {
             **self.data,
             "num_runs": len(self.runs),
@@ -151,7 +154,7 @@ class Report:
             "counts": markdown(counts_grid(self.claims)),
             "papers": self.papers,
             "limits": self.limits,
-            "own": [table for table in own if table.is_run or table.page != STUDIES],
+            "own": own,
             "papers_tables": of_papers,
             "studies": self.studies.items(),
             "any_verdict": bool((self.claims["verdict"] != "not run").any()),

@@ -16,10 +16,10 @@ from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.effects import effects_of
 from sweeps.judge.judged_table import JudgedTable
-from sweeps.judge.reader import SEED, RunReader
 from sweeps.plan.request import DEFAULT_SCALE, TAG
 from sweeps.run.progress import duration
 from sweeps.score.efficiency import million_parameters
+from sweeps.score.reader import SEED, RunReader
 from sweeps.show.claims import claim_grids, claim_lines, claims_frame, counted
 from sweeps.show.effects import effects_grids
 from sweeps.show.publish import drawn_of, grid_of

@@ -32,13 +32,21 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
         name = names.region(region)
         if any(f"test/{name}" in seed for seeds in scores.values() for seed in seeds):
             metrics.append(name)
-    has_seeds = any(len(group) > 1 for group in groups.values())
     header = ["configuration", "seeds", *metrics]
+    has_seeds = any(len(group) > 1 for group in groups.values())
     if not has_seeds:
         header.append("run")
     rows = []
     for label, group in groups.items():
-        row = [label, *_group_cells(scores[label], metrics)]
+        cells = []
+        for metric in metrics:
+            values = [seed.get(f"test/{metric}", "not run") for seed in scores[label]]
+            cells.append(over_seeds(dict(enumerate(values))))
+        count = cells[0].seeds
+        row = [label, f"{count} of {len(group)}" if count < len(group) else str(count)]
+        for cell in cells:
+            spread = f" ± {number(cell.sd)}" if cell.seeds > 1 else ""
+            row.append(f"{number(cell.mean)}{spread}")
         if not has_seeds:
             row.append(" ".join(group[0].keys) or ABSENT)
         rows.append(tuple(row))
@@ -49,20 +57,6 @@ def _scores(outcome: Outcome) -> Mapping[str, float]:
     """The scores of a point by name; empty where it has none."""
     is_finished = outcome.state == "finished" and outcome.results
     return outcome.results[0].recorded_scores() if is_finished else {}
-
-
-def _group_cells(seeds: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> list[str]:
-    """The number of seeds, then the mean and spread of every metric."""
-    texts = []
-    count = 0
-    for place, metric in enumerate(metrics):
-        by_seed = {n: scores.get(f"test/{metric}", "not run") for n, scores in enumerate(seeds)}
-        cell = over_seeds(by_seed)
-        if place == 0:
-            count = cell.seeds
-        spread = f" ± {number(cell.sd)}" if cell.seeds > 1 else ""
-        texts.append(f"{number(cell.mean)}{spread}")
-    return [f"{count} of {len(seeds)}" if count < len(seeds) else str(count), *texts]
 
 
 def unfinished_grid(outcomes: Sequence[Outcome]) -> TextTable:

@@ -27,18 +27,8 @@ FORMS: dict[Form, str] = {
     "released": "Form: no row of this table has a released form that differs from the text.",
 }
 COUNTED = f"Parameters are those of the networks at scale={SCALE}, without discriminators."
-CSV_HEADER = (
-    "table",
-    "row",
-    "column",
-    "mean",
-    "sd",
-    "n",
-    "published",
-    "difference",
-    "reason",
-    "runs",
-)
+CSV_HEADER = ["table", "row", "column", "mean", "sd", "n", "published", "difference", "reason"]
+CSV_HEADER += ["runs"]
 
 Style = Literal["terminal", "markdown"]
 # How all other values, the best and the second best of a column are shown, and what says so.
@@ -90,26 +80,23 @@ def tidy_csv(scored: ScoredTable) -> str:
 
     Values are in the unit of the table; `n` is the number of seeds, `runs` are keys of runs.
     """
-    rows: list[tuple[object, ...]] = [CSV_HEADER]
+    rows: list[list[object]] = [[*CSV_HEADER]]
     nothing = TableCell(math.nan, math.nan, 0)
     for row in scored.table.rows:
         for column in scored.table.columns:
             cell = scored.cells.get((row.label, column.name), nothing)
             printed = published(row, column)
-            rows.append(
-                (
-                    scored.name,
-                    row.label,
-                    column.name,
-                    plain(cell.mean),
-                    plain(cell.sd),
-                    cell.seeds,
-                    "" if printed is None else printed,
-                    plain(scored.difference(row, column)),
-                    cell.reason,
-                    " ".join(cell.keys),
-                )
-            )
+            line = [
+                scored.name,
+                row.label,
+                column.name,
+                plain(cell.mean),
+                plain(cell.sd),
+                cell.seeds,
+            ]
+            line += ["" if printed is None else printed, plain(scored.difference(row, column))]
+            line += [cell.reason, " ".join(cell.keys)]
+            rows.append(line)
     return csv_text(rows)
 
 

@@ -10,11 +10,11 @@ import pytest
 from analysis.results import finished_runs
 from rgbt.runs.folder import RunFolder, read_description
 from sweeps.judge.judged_table import JudgedTable
-from sweeps.judge.reader import RunReader
 from sweeps.judge.stored_tables import judged_tables
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import REQUESTED
 from sweeps.plan.table import Table, load_table
+from sweeps.score.reader import RunReader
 from tests.sweeps.show.planted import plant
 
 NAME, WORDS = "crm/table3a", ("optimizer.lr=-1", "masker=crm")
