@@ -33,7 +33,6 @@ COLUMNS += ["scale", "start"]
 # Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
 
-
 # Numbers of a claim without a verdict.
 NO_VERDICT = Verdict(
     kind="undecided",
