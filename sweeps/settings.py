@@ -119,8 +119,7 @@ def read_settings(node: DictConfig) -> SweepSettings:
         raise InputError(f"hydra/launcher={name}: a sweep works with {', '.join(WORKING)}{hint}.")
     if name == "ray" and find_spec("ray") is None:
         raise InputError("hydra/launcher=ray: it needs pip install 'rgbt[ray]'.")
-    options = OmegaConf.to_container(node.launcher, resolve=True)
-    assert isinstance(options, dict), "the node of a launcher is a mapping"
+    options = cast("dict[str, Any]", OmegaConf.to_container(node.launcher, resolve=True))
     options.pop("_target_", None)
     plain: dict[str, Any] = {}
     unresolved = OmegaConf.to_container(node.sweeper, resolve=False)
