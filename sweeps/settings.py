@@ -137,4 +137,6 @@ def read_settings(node: DictConfig) -> SweepSettings:
             "hydra.sweeper.timeout_minutes needs hydra.sweeper.wait=true: the command stops the "
             "jobs. SLURM has a limit of its own, hydra.launcher.timeout_min."
         )
+    if not settings.wait and name in ("basic", "submitit_local"):  # before a study is written
+        raise InputError("hydra.sweeper.wait=false: runs of this machine end with the command.")
     return replace(settings, launcher=name, launcher_options=options)

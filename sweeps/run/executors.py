@@ -47,7 +47,5 @@ def open_executor(settings: SweepSettings) -> Executor:
         cluster = settings.launcher.removeprefix("submitit_")
         executor = SubmititExecutor(cluster, settings.launcher_options, settings.workers)
     if not settings.wait and not executor.is_lasting:
-        raise InputError(
-            "hydra.sweeper.wait=false: these runs end with the command; SLURM's and Ray's do not."
-        )
+        raise InputError("hydra.sweeper.wait=false: this Ray ends with the command.")
     return executor

@@ -86,6 +86,11 @@ def test_objectives_reported_during_training() -> None:
     assert followed == [True, True, False, False]
 
 
+def test_jobs_of_this_machine_are_waited_for() -> None:
+    with pytest.raises(InputError, match=r"hydra\.sweeper\.wait=false: runs of this machine"):
+        changed(wait=False)
+
+
 def test_a_time_limit_needs_a_command_that_waits() -> None:
     with pytest.raises(InputError, match=r"timeout_minutes needs hydra\.sweeper\.wait=true"):
         changed(wait=False, timeout_minutes=5)

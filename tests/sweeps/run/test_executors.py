@@ -31,8 +31,6 @@ def test_jobs_of_this_machine_are_waited_for() -> None:
     found = [open_executor(settings(workers=workers)) for workers in (None, 3)]
     assert [type(executor) for executor in found] == [LocalExecutor, LocalExecutor]
     assert [executor.slots for executor in found] == [1, 3]
-    with pytest.raises(InputError, match=r"wait=false: .*SLURM"):
-        open_executor(settings(wait=False))
 
 
 def test_jobs_of_slurm_are_found_with_any_variables_of_the_user(
