@@ -13,6 +13,7 @@ from zipfile import ZipFile
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from rgbt.checks import InputError, RunError
@@ -177,9 +178,9 @@ def plain(value: Any) -> Any:
 @contextmanager
 def limited(headroom: int) -> Iterator[None]:
     """Fail to allocate more than `headroom` bytes beyond what the process has."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + headroom, before[1]))
+    most = psutil.Process().memory_info().vms + headroom
+    resource.setrlimit(resource.RLIMIT_AS, (most, before[1]))
     try:
         yield
     finally:

@@ -37,7 +37,7 @@ RUN = [
     *(("optimizer.lr=fast", "'optimizer.lr'"), ("trainer.clip_norm=nan", "'trainer.clip_norm'")),
     *(("seed=[0,1]", "'seed'"), ("seeds=3", "'seeds'"), ("learning", "'learning'")),
     ("--experiment=grbm", "'--experiment=grbm' is not an option"),
-    ("runs_dir=/proc/no", "runs_dir=/proc/no: cannot write in /proc (No such file"),
+    ("runs_dir=/dev/null/no", "runs_dir=/dev/null/no: cannot write in /dev/null (Not a directory"),
     *(("model.width", "'model.width': expected KEY=VALUE"), ("=3", "'=3': expected KEY=VALUE")),
     ("model.width=[1", "'model.width=[1': no viable alternative"),
     ("-m hydra.sweeper.study=nan seed=0,1", "'hydra.sweeper.study': expected a finite value"),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
+
+import psutil
 
 DEADLINE_S = 180.0
 """Generous: the machine may be busy. Nothing waits for it but a test that fails."""
@@ -25,6 +26,6 @@ def until(condition: Callable[[], Any], what: str, poll_s: float = 0.01) -> Any:
 def is_alive(pid: int) -> bool:
     """Whether a process of this machine runs; a zombie does not."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
+        return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
         return False
