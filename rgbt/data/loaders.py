@@ -358,6 +358,9 @@ def _end_with_parent() -> None:
     # In a sweep, os.getppid is a server that forks the workers and outlives the main process.
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a main process"
+    if not hasattr(signal, "sigtimedwait"):  # macOS
+        parent.join()
+        os._exit(0)
     while parent.is_alive():
         received = signal.sigtimedwait(ENDING, LOOK_S)
         if received and received.si_signo == signal.SIGTERM and received.si_pid == parent.pid:

@@ -21,6 +21,7 @@ from rgbt.types import Batch
 from tests.checkpoints.test_torch_files import same
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
+from tests.waiting import DEADLINE_S
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -185,6 +186,17 @@ def test_workers_leave_group_signals_to_the_main_process() -> None:
     worker.terminate()
     worker.join(5)
     assert worker.exitcode == 0, "the main process ends them"
+
+
+def test_workers_end_where_no_signal_can_be_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on macOS."""
+    monkeypatch.delattr(signal, "sigtimedwait")
+    loader = DataLoader(range(4), batch_size=None, num_workers=1, worker_init_fn=start_worker)
+    found = started(loader)
+    (worker,) = found._workers  # type: ignore[attr-defined]
+    assert list(found) == [0, 1, 2, 3]
+    worker.join(DEADLINE_S)
+    assert worker.exitcode == 0
 
 
 def test_library_error_after_a_signal_is_its_consequence(call: Call) -> None:
