@@ -397,40 +397,34 @@ def is_counted(column: Column) -> bool:
     return column.metric is not None
 
 
-def table_names(folder: Path = OWN) -> list[str]:
-    """Return the names for `load_table`: the papers' tables, then those in `folder`."""
+def table_names(*folders: Path) -> list[str]:
+    """Return the names for `load_table` of the tables in folders."""
     names = []
-    for root in (PUBLISHED, folder):
-        for path in sorted(root.rglob("*.yaml")):
-            names.append(path.relative_to(root).with_suffix("").as_posix())
+    for folder in folders:
+        for path in sorted(folder.rglob("*.yaml")):
+            names.append(path.relative_to(folder).with_suffix("").as_posix())
     return names
 
 
-def study_names() -> list[str]:
-    """Return the names for `load_table` of our own studies."""
-    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
-
-
-def table_path(name: str, folder: Path = OWN) -> Path:
+def table_path(name: str) -> Path:
     """Find the file of a table; InputError: no such table, or two of that name.
 
-    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one in
-    the `folder` of the user's tables; or a path that ends in .yaml.
+    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one of
+    the user; or a path that ends in .yaml.
     """
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
-    places = [root / f"{name}.yaml" for root in (PUBLISHED, STUDIES, folder)]
-    paths = [path for path in places if path.is_file()]
+    folders = (PUBLISHED, STUDIES, OWN)
+    paths = [folder / f"{name}.yaml" for folder in folders if (folder / f"{name}.yaml").is_file()]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
-        known = [*table_names(folder), *study_names()]
-        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
+        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(*folders))}.")
     return paths[0]
 
 
-def load_table(name: str, folder: Path = OWN) -> Table:
+def load_table(name: str) -> Table:
     """Read and check a table (see `table_path`); InputError names its file and the wrong key."""
-    path = table_path(name, folder)
+    path = table_path(name)
     table: Table = check_value(str(path), read_yaml(path), Table)
     return table

@@ -15,7 +15,7 @@ from analysis.archive import archived
 from rgbt.tracking.tracker import Tracking
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Point
-from sweeps.reproduce import Options, reproduce_several, settings_of
+from sweeps.reproduce import Options, run_tables, settings_of
 from sweeps.run import driver as drivers
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
@@ -65,7 +65,6 @@ class QuickPlanner(FakePlanner):
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sweeps.plan.table.study_names", list)
     # The scores of fake runs are not those of their counts.
     monkeypatch.setattr("analysis.archive.check_result", lambda _: None)
     write_table("one", ("crm", "baseline"), [("crm", "baseline")])
@@ -84,7 +83,7 @@ def run(
     chosen = Options(table=table, runs_dir=place / "runs", **options)
     runs, planner = RunStore(place / "runs", Tracking()), QuickPlanner()
     with driven_by(executor := FakeExecutor(behaviour), FakeView()):
-        code = reproduce_several(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
+        code = run_tables(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
     return code, [words[0].removeprefix("+experiment=") for words in executor.started()]
 
 
@@ -161,7 +160,7 @@ def test_dry_run_prints_the_order_with_minutes(
 def test_a_table_with_runs_of_another_machine_waits(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(place, table="my/two")[0] == 0
+    assert run(place, table="my/two,my/wrong")[0] == 0
     for archive in sorted((place / "results").glob("*.zip"))[1:]:
         archive.unlink()
     there = place / "there"

@@ -12,13 +12,13 @@ import pytest
 import yaml
 
 from sweeps.judge.contrasts import as_claimed, contrasts_of, printed_values
-from sweeps.plan.table import Row, load_table, table_names
+from sweeps.plan.table import PUBLISHED, Row, load_table, table_names
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
-OURS = {name: load_table(name) for name in table_names(Path("none"))}
+OURS = {name: load_table(name) for name in table_names(PUBLISHED)}
 
 of_reference = pytest.mark.skipif(
     not all((FOLDER / f"{paper}.yaml").is_file() for paper in PAPERS),

@@ -16,7 +16,6 @@ from sweeps.plan.request import (
     check_equal_runs,
     external_rows,
     make_request,
-    read_named,
     seeds_of,
     select_rows,
 )
@@ -103,9 +102,7 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
         *("pretrained.mask2former_swin_t=/w/t=1.pth", "pretrained.mask2former_swin_b=b.pth"),
         "x=1",
     )
-    name, published = read_named("spatialseg/table7")
-    words = TableRequest(name, published, "paper", (0,), given)
-    wanted = make_request(words)
+    wanted = make_request("spatialseg/table7", "paper", words=given)
     assert wanted.external == ()
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
@@ -113,17 +110,15 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
     assert wanted.typed_overrides() == ("x=1", *given[:2])
-    misspelt = replace(words, extra=("pretrained.mask2former_swinb=x",))
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
-        make_request(misspelt)
+        make_request("spatialseg/table7", "paper", words=["pretrained.mask2former_swinb=x"])
 
 
 def test_form_and_rows_make_another_table() -> None:
-    name, published = read_named("spatialseg/table3")
-    plain = TableRequest(name, published, "demo", (0,))
-    released = replace(plain, form="released")
-    chosen = ((plain, ""), (plain, "Ny/4,Ny/8"), (released, ""))
-    made = [make_request(request, rows) for request, rows in chosen]
+    chosen = (("paper", ""), ("paper", "Ny/4,Ny/8"), ("released", ""))
+    made = [
+        make_request("spatialseg/table3", "demo", form=form, rows=rows) for form, rows in chosen
+    ]
     variants = [request.variant for request in made]
     assert variants[0] == "demo"
     assert variants[1].startswith("demo-")
@@ -134,9 +129,7 @@ def test_form_and_rows_make_another_table() -> None:
 
 
 def test_both_forms_are_compared_by_claims() -> None:
-    name, published = read_named("spatialseg/table3")
-    typed = TableRequest(name, published, "demo", (0,))
-    request = make_request(typed, "Ny/4,Ny/8", both=True)
+    request = make_request("spatialseg/table3", "demo", form="both", rows="Ny/4,Ny/8")
     labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
     assert [row.label for row in request.table.rows] == labels
     words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
