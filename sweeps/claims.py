@@ -18,8 +18,6 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from sweeps.judge.judged_table import JudgedClaim
 
-ALL = "all"
-
 
 @dataclass(frozen=True)
 class Options:
@@ -27,7 +25,7 @@ class Options:
 
     table: Annotated[
         str, Help("such as spatialseg/table3; a,b; all: every table of the papers")
-    ] = ALL
+    ] = "all"
     scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
     form: Annotated[Literal["paper", "released"], Help("form of the rows")] = "paper"
     runs_dir: RunsDir = Path("runs")
@@ -83,9 +81,8 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from sweeps.score.efficiency import network_sizes
     from sweeps.score.reader import RunReader
 
-    names = table_names(PUBLISHED)
-    if options.table != ALL:
-        names = split_list(options.table, "tables")
+    is_all = options.table == "all"
+    names = table_names(PUBLISHED) if is_all else split_list(options.table, "tables")
     check_overrides(overrides)
     reader = RunReader(finished_runs(options.runs_dir, options.archive))
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))

@@ -184,9 +184,8 @@ def requested_tables(
 
     if not is_several(options):
         return [_request(options, options.table, words, planner)]
-    names = table_names(PUBLISHED, STUDIES)
-    if options.table != "all":
-        names = split_list(options.table, "tables")
+    is_all = options.table == "all"
+    names = table_names(PUBLISHED, STUDIES) if is_all else split_list(options.table, "tables")
     requests = []
     for name in names:
         try:

@@ -42,8 +42,8 @@ TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
 PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
 TAG_LENGTH = 5000
 
-# Prefix of the tag that says how the rows were requested, where that is not plainly: their form,
-# the digest of the settings of the row alone, and the words that were typed for all rows.
+# Prefix of the tag with the form of the rows, the digest of the settings of the row alone, and the
+# words that were typed for all rows; without words, the paper's form has none.
 REQUESTED = "rgbt.requested/"
 
 # Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
@@ -128,14 +128,9 @@ class TableRequest:
         points = []
         for overrides, labels in sharing.items():
             more = f" (and {len(labels) - 1} more)" if len(labels) > 1 else ""
-            points.append(
-                Point(
-                    f"{labels[0]}{more} {overrides[-1]}",
-                    overrides,
-                    tags=self.tags(labels),
-                    evaluations=self.evaluations(labels),
-                )
-            )
+            label = f"{labels[0]}{more} {overrides[-1]}"
+            evaluations = self.evaluations(labels)
+            points.append(Point(label, overrides, {}, self.tags(labels), evaluations=evaluations))
         return points
 
     def tags(self, labels: Sequence[str]) -> dict[str, str]:
@@ -294,12 +289,7 @@ def select_rows(table: Table, text: str) -> Table:
         group = {row.label for row in table.rows if row.group == word}
         chosen |= group or {row_named(word, table).label}
     origin = _origins(table)
-    first: dict[str, str] = {}
-    rows = []
-    for row in table.rows:
-        if row.label in chosen:
-            same = first.setdefault(origin[row.label], row.label)
-            rows.append(replace(row, same_as=None if same == row.label else same))
+    rows = [replace(row, same_as=origin[row.label]) for row in table.rows if row.label in chosen]
 
     # "Better than all others" is another statement where some of the others are missing.
     claims = table.claims
@@ -391,7 +381,8 @@ def seeds_of(text: str) -> tuple[int, ...]:
 def _origins(table: Table) -> dict[str, str]:
     origin: dict[str, str] = {}
     for row in table.rows:
-        origin[row.label] = origin.get(row.same_as or "", row.label)
+        same = row.same_as or row.label  # perhaps a row that was not selected
+        origin[row.label] = origin.get(same, same)
     return origin
 
 

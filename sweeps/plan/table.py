@@ -208,7 +208,7 @@ class Table(Strict):
         return replace(self, rows=(*self.rows, *(Row(**row) for row in of_design)))
 
     @model_validator(mode="after")
-    def _check_names(self) -> Table:
+    def _check(self) -> Table:
         check_different([column.name for column in self.columns])
         check_different([row.label for row in self.rows])
         check_different([claim.name for claim in self.claims])
@@ -218,10 +218,13 @@ class Table(Strict):
                 check_choice("at", scale, available("scale"))
         if self.regions != "as trained":
             check_choice("regions", self.regions, available("metric"))
+        self._check_columns()
+        self._check_rows()
+        for claim in self.claims:
+            self._check_claim(claim)
         return self
 
-    @model_validator(mode="after")
-    def _check_columns(self) -> Table:
+    def _check_columns(self) -> None:
         known = [column.name for column in self.columns if is_counted(column)]
         for column in self.columns:
             for name in column.sources:  # they are computed in order
@@ -230,10 +233,8 @@ class Table(Strict):
                 known.append(column.name)
         for name in self.design.outcomes if self.design else ():
             check_choice("design.outcomes", name, self._names)
-        return self
 
-    @model_validator(mode="after")
-    def _check_rows(self) -> Table:
+    def _check_rows(self) -> None:
         printed = [column.name for column in self.columns if column.printed]
         metrics = [column.metric for column in self.columns if column.metric is not None]
         earlier: list[str] = []
@@ -250,38 +251,26 @@ class Table(Strict):
                 for key in re.findall(r"{(\w+)}", metric):
                     check_choice(f"{where}, settings for '{metric}'", key, row.settings)
                 parse(metric.format_map(row.settings))
-        return self
 
-    @model_validator(mode="after")
-    def _check_claims(self) -> Table:
-        labels = [row.label for row in self.rows]
-        for claim in self.claims:
-            where = f"claim '{claim.name}'"
-            if claim.effect:
-                self._check_effect(claim, where)
-                continue
-            against = () if claim.against in ((OTHERS,), (PREVIOUS,)) else claim.against
-            for label in (*claim.rows, *against):
-                check_choice(f"{where}, rows", label, labels)
-            minus = () if claim.minus_column is None else (claim.minus_column,)
-            for name in (*claim.columns, *minus):
-                check_choice(f"{where}, columns", name, self._names)
-            if not claim.columns or not list(claim.pairs(labels)):
-                raise ValueError(f"{where}: there is nothing to compare.")
-        return self
-
-    def _check_effect(self, claim: Claim, where: str) -> None:
-        """Refuse a claim about what is not in the design."""
-        design = self.design
-        methods = [method.name for method in design.methods] if design else []
-        for name in claim.rows:
-            check_choice(f"{where}, methods", name, methods)
-        for name in claim.columns:
-            check_choice(f"{where}, outcomes", name, design.outcomes if design else ())
-        for letter in claim.effect:
-            check_choice(f"{where}, effect", letter, design.letters if design else ())
-        if design and claim.part:
-            check_choice(f"{where}, part", claim.part, design.parts)
+    def _check_claim(self, claim: Claim) -> None:
+        where, design = f"claim '{claim.name}'", self.design
+        labels, names = [row.label for row in self.rows], self._names
+        if claim.effect:
+            if design is None:
+                raise ValueError(f"{where}: an effect is one of a design.")
+            labels, names = [method.name for method in design.methods], list(design.outcomes)
+            for letter in claim.effect:
+                check_choice(f"{where}, effect", letter, design.letters)
+            if claim.part:
+                check_choice(f"{where}, part", claim.part, design.parts)
+        against = () if claim.against in ((OTHERS,), (PREVIOUS,)) else claim.against
+        for label in (*claim.rows, *against):
+            check_choice(f"{where}, rows", label, labels)
+        minus = () if claim.minus_column is None else (claim.minus_column,)
+        for name in (*claim.columns, *minus):
+            check_choice(f"{where}, columns", name, names)
+        if not claim.columns or not list(claim.pairs(labels)):
+            raise ValueError(f"{where}: there is nothing to compare.")
 
     @property
     def _names(self) -> list[str]:
@@ -339,28 +328,24 @@ class Table(Strict):
                 replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
             )
             for column in compared:
-                if column in self.columns_of(row):
-                    claims.append(_released_is_higher(row, column))
+                if column not in self.columns_of(row):
+                    continue
+                claim = Claim(
+                    name=f"{label}, {column.name}",
+                    says=f"{row.label}: the released form has a higher {column.name}.",
+                    source="form=both",
+                    rows=(label,),
+                    against=(row.label,),
+                    columns=(column.name,),
+                    expected="higher",
+                )
+                claims.append(claim)
         if not claims:
             raise InputError(
                 f"form=both: no row of {self.paper}, {self.number} has a released form of its own; "
                 "use form=paper."
             )
         return replace(self, rows=tuple(rows), claims=tuple(claims))
-
-
-def _released_is_higher(row: Row, column: Column) -> Claim:
-    """Return the claim that form=both judges of a row and column."""
-    label = f"{row.label}{RELEASED}"
-    return Claim(
-        name=f"{label}, {column.name}",
-        says=f"{row.label}: the released form has a higher {column.name}.",
-        source="form=both",
-        rows=(label,),
-        against=(row.label,),
-        columns=(column.name,),
-        expected="higher",
-    )
 
 
 def metric_of(column: Column, row: Row) -> str:

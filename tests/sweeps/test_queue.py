@@ -88,7 +88,7 @@ def run(
 
 
 def test_runs_that_decide_most_claims_a_minute_come_first(
-    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # cmx is needed by two claims of two runs each; with it, the other claims lack one run each.
     assert run(place) == (0, ["cmx", "rtfnet", "mfnet", "crm", "baseline"])
@@ -136,19 +136,16 @@ def test_a_failed_run_does_not_end_the_queue(place: Path) -> None:
     assert run(place, fail) == (1, []), "it is not repeated"
 
 
-def test_commands_are_in_the_order_of_the_queue(place: Path) -> None:
-    assert run(place, commands=place / "file") == (0, [])
-    lines = (place / "file").read_text().splitlines()
-    names = [line.partition("+experiment=")[2].split()[0] for line in lines]
-    assert names == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
-
-
-def test_dry_run_prints_the_order_with_minutes(
+def test_commands_and_dry_run_have_the_order_with_minutes(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    order = ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
+    assert run(place, commands=place / "file") == (0, [])
+    commands = (place / "file").read_text().splitlines()
+    assert [line.partition("+experiment=")[2].split()[0] for line in commands] == order
     assert run(place, dry_run=True) == (0, [])
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if "seed=0" in line]
-    assert [line[0] for line in lines] == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
+    assert [line[0] for line in lines] == order
     assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
     assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
     assert not (place / "runs").exists()

@@ -126,6 +126,8 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
         ("table=my/small camera@consistency.view.camera=synth", "rgbt consistency"),
         ("table=my/small hydra/launcher=joblib", "its n_jobs is workers)"),
         ("table=my/small hydra.launcher.partition=gpu", "partition"),
+        ("table=my/small hydra.sweeper.workers=2", "hydra.sweeper.workers=2: of Hydra's words"),
+        ("table=my/small +hydra.launcher.key=1", "+hydra.launcher.key=1: of Hydra's words"),
         ("", "'table'"),
     ],
 )
@@ -155,15 +157,6 @@ def test_options_of_execution_are_sweep_settings() -> None:
     found = settings_of(Options("my/small", **changes), words)
     assert vars(found).items() >= {**changes, "commands": "file"}.items()
     assert (found.launcher, found.launcher_options["num_gpus"]) == ("ray", 0.25)
-
-
-@pytest.mark.parametrize("word", ["hydra.sweeper.workers=2", "+hydra.launcher.key=1"])
-def test_words_of_hydra_that_would_have_no_effect_are_refused(
-    place: Path, call: Call, word: str
-) -> None:
-    code, _, err = call(entry, "table=my/small", "dry_run=true", word)
-    assert code == 2
-    assert_one_sentence(err, f"{word}: of Hydra's words")
 
 
 def test_other_rows_seeds_and_scales_are_other_studies(

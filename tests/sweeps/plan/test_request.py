@@ -167,32 +167,23 @@ def test_selected_rows_keep_their_claims() -> None:
     chosen = select_rows(made, "c,1")
     assert [row.label for row in chosen.rows] == ["a", "c"]
     assert [claim.name for claim in chosen.claims] == ["c_a"]
-    assert select_rows(made, "b").rows[0].same_as is None
     assert select_rows(made, "a,b,c").claims == made.claims
-
-
-def test_twins_of_a_row_left_out_stay_declared() -> None:
-    rows = (
-        Row(label="a", experiment="crm"),
-        Row(label="b", experiment="crm", same_as="a"),
-        Row(label="c", experiment="crm", same_as="b"),
-        Row(label="d, with comma", experiment="grbm"),
-    )
-    chosen = select_rows(table(rows), "b,c,4")
-    assert [(row.label, row.same_as) for row in chosen.rows] == [
-        *(("b", None), ("c", "b"), ("d, with comma", None)),
-    ]
     with pytest.raises(InputError, match="'e'"):
-        select_rows(table(rows), "e")
+        select_rows(made, "e")
 
 
 def test_undeclared_rows_of_one_run_are_refused() -> None:
-    first, third = (Row(label=label, experiment="baseline") for label in "ac")
+    first, third, fourth = (Row(label=label, experiment="baseline") for label in ("a", "c", "d, e"))
     same = Row(label="b", experiment="baseline", same_as="a")
+    request = TableRequest("own/t", table((first, third)), "demo")
     with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):
-        check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
-    third = replace(third, same_as="b")
-    check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
+        check_equal_runs(request, Planner())
+    declared = table((first, same, replace(third, same_as="b"), fourth))
+    # Twins of a row that is left out stay declared.
+    for rows in ("a,b,c", "b,c", "a,c"):
+        check_equal_runs(replace(request, table=select_rows(declared, rows)), Planner())
+    with pytest.raises(InputError, match="'b' and 'd, e'"):
+        check_equal_runs(replace(request, table=select_rows(declared, "b,c,4")), Planner())
 
 
 NAMED = table(
