@@ -220,21 +220,16 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     important, remark = importances(study, trials)
     grids += [important] if important else []
     out.mkdir(parents=True, exist_ok=True)
-    ways = []
-    for metric, is_up in objectives(study).items():
-        ways.append(f"{'highest' if is_up else 'lowest'} {metric}")
-    command = without_passwords(study.user_attrs.get(names.COMMAND, ""))
-    remarks = [f"Importances: {remark}"] if remark else []
-    text = [
-        f"# Study {study.study_name}",
-        f"Objectives: {', '.join(ways)}.",
-        *([f"Created by `{command}`."] if command else []),
-        *(grid.to_markdown() for grid in grids),
-        *remarks,
-    ]
+    ways = [f"{'highest' if up else 'lowest'} {name}" for name, up in objectives(study).items()]
+    text = [f"# Study {study.study_name}", f"Objectives: {', '.join(ways)}."]
+    if command := without_passwords(study.user_attrs.get(names.COMMAND, "")):
+        text.append(f"Created by `{command}`.")
+    text += [grid.to_markdown() for grid in grids]
+    said = f"Importances: {remark}" if remark else ""
+    text += [said] if said else []
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
     write_atomic(out / "trials.csv", trials.to_csv(index=False).encode())
-    print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
+    print_rich(Group(*map(rich_table, grids), plain_text(said)))
     lines = [("report", str(out / "study.md"))]
     if find_spec("optuna_dashboard"):
         lines.append(("figures", f"optuna-dashboard {without_passwords(url)}"))
