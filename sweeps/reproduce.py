@@ -177,8 +177,7 @@ def requested_tables(
 ) -> list[TableRequest]:
     """Return the tables; of several, one that cannot be trained is left out with a line.
 
-    InputError: an option or a word does not fit the table (of several: any of them), or
-    seeds=until_decided of a table without claims.
+    InputError: an option or a word does not fit the table, or none of several can be trained.
     """
     from sweeps.plan.table import PUBLISHED, STUDIES, table_names
 

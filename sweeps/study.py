@@ -35,8 +35,7 @@ OF_TRIAL = ("trial", "state", "label")
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
 
-# Rows of the table of best trials; the CSV has all.
-TOP = 10
+TOP = 10  # rows of the table of best trials; the CSV has all
 
 # Scores that are shown also where they are no objective.
 ALWAYS = (metric_names.MIOU, metric_names.VAR)
@@ -194,7 +193,6 @@ def importances(study: optuna.Study, trials: pd.DataFrame) -> tuple[TextTable | 
 
 
 def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) -> TextTable:
-    """Write columns of a frame, some under other names, as text."""
     import pandas as pd
 
     def text(name: str, value: object) -> str:

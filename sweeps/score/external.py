@@ -198,7 +198,6 @@ class ExternalRun:
         return ("analysis.score", "resamples=0", f"regions={metric.regions}", *of_folder), ""
 
     def _metric(self, words: Words) -> Any:
-        """Return the node that says how a measurement cuts images into regions."""
         names = [word.removeprefix("regions=") for word in words if word.startswith("regions=")]
         return compose([f"metric={names[0]}"]).metric if names else self.config.metric
 

@@ -117,6 +117,6 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
                 assert any(f"{claim.at_most:g}" in remark for remark in claim.remarks), claim.name
             if name[0] in "cs" and found[f"{name} {claim.name}"] is False:
                 assert any("printed" in remark for remark in claim.remarks), claim.name
-    listed = {name.strip(): False for name in CONTRADICTED.split(",")}
+    listed: dict[str, bool | None] = {name.strip(): False for name in CONTRADICTED.split(",")}
     listed |= {name.strip(): None for name in NOT_PRINTED.split(",")}
     assert {key: word for key, word in found.items() if word is not True} == listed
