@@ -18,8 +18,6 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from sweeps.judge.judged_table import JudgedClaim
 
-ALL = "all"
-
 
 @dataclass(frozen=True)
 class Options:
@@ -27,7 +25,7 @@ class Options:
 
     table: Annotated[
         str, Help("such as spatialseg/table3; a,b; all: every table of the papers")
-    ] = ALL
+    ] = "all"
     scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
     form: Annotated[Literal["paper", "released"], Help("form of the rows")] = "paper"
     runs_dir: RunsDir = Path("runs")
@@ -78,25 +76,23 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from sweeps.judge.judged_table import JudgedTable
     from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
-    from sweeps.plan.request import TableRequest, check_override, make_request, read_named
-    from sweeps.plan.table import table_names
+    from sweeps.plan.request import check_overrides, make_request
+    from sweeps.plan.table import PUBLISHED, load_table, table_names
     from sweeps.score.efficiency import network_sizes
     from sweeps.score.reader import RunReader
 
-    names = table_names(Path("none"))
-    if options.table != ALL:
-        names = split_list(options.table, "tables")
-    for word in overrides:
-        check_override(word)
+    is_all = options.table == "all"
+    names = table_names(PUBLISHED) if is_all else split_list(options.table, "tables")
+    check_overrides(overrides)
     reader = RunReader(finished_runs(options.runs_dir, options.archive))
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
-    for named in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(named)
-        if not table.claims:
+    for name in track(names, "judging", console=Console(stderr=True), transient=True):
+        if not load_table(name).claims:
             continue
-        typed = TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
-        request = make_request(typed, planner=planner)
+        request = make_request(
+            name, options.scale, words=overrides, form=options.form, planner=planner
+        )
         for row in request.external:
             raise InputError(
                 f"{row.kind}.{row.label}: only finished runs are judged here; "

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from rgbt.checks import InputError
 from rgbt.config.options import Help
@@ -34,35 +32,21 @@ def new(options: NewOptions, overrides: list[str]) -> int:
 
     Overrides with comma lists are the varied keys: masker.sigma_div=1,2,4 masker.patch_size=32,64
     """
-    from sweeps.plan.table import OWN, load_table
-
-    path = write_new(options.table, options.experiment, overrides, OWN)
-    sys.stdout.write(
-        f"{path} has {len(load_table(options.table).rows)} rows; run them with\n"
-        f"rgbt reproduce table={options.table} seeds=3 workers=2\n"
-    )
-    return 0
-
-
-def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path) -> Path:
-    """Write the file of a new table into `folder`; every row is composed and checked before.
-
-    Comma lists of `overrides` are varied, all with all.
-    """
     import yaml
 
     from rgbt.config.compose import PIXELS
     from rgbt.config.overrides import composing
     from rgbt.files.atomic import write_atomic
     from sweeps.plan.planner import specify_run
-    from sweeps.plan.table import PUBLISHED
+    from sweeps.plan.table import OWN, PUBLISHED
     from sweeps.point import short_names
     from sweeps.space import grid_points, split
 
-    path = folder / f"{name}.yaml"
+    name, experiment = options.table, options.experiment
+    path = OWN / f"{name}.yaml"
     if path.exists() or (PUBLISHED / f"{name}.yaml").exists():
         raise InputError(f"table={name} already exists; edit it, or choose another name.")
-    if not path.resolve().is_relative_to(folder.resolve()):
+    if not path.resolve().is_relative_to(OWN.resolve()):
         raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
     with composing(overrides):
         fixed, varied, _ = split(overrides)
@@ -70,8 +54,8 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         raise InputError(f"{min(wrong)}=...: choose it when you run the table.")
     if not varied:
         raise InputError("no key is varied; give a comma list, such as masker.sigma_div=1,2,4.")
-    short = {key: name.lstrip("+") for key, name in short_names(varied).items()}
-    rows: list[dict[str, Any]] = []
+    short = {key: end.lstrip("+") for key, end in short_names(varied).items()}
+    rows = []
     for point in grid_points(fixed, varied):
         specify_run([f"+experiment={experiment}", *point.overrides])
         words = [word.partition("=") for word in point.overrides]
@@ -80,7 +64,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         label = PIXELS.sub(r"\1px", re.sub(r"\\(.)", r"\1", text)).replace("'", "")
         rows.append({"label": label, "experiment": experiment, "overrides": list(point.overrides)})
     paper, _, number = name.rpartition("/")
-    table: dict[str, Any] = {
+    table = {
         "paper": paper or "own",
         "number": number,
         "caption": f"{experiment} with {' and '.join(short.values())} varied.",
@@ -90,8 +74,13 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
             {"name": "mIoU", "metric": "mIoU"},
             {"name": "Var", "metric": "Var", "best": "lowest"},
         ],
+        "rows": rows,
     }
-    text = yaml.safe_dump({**table, "rows": rows}, sort_keys=False, width=1000)
+    text = yaml.safe_dump(table, sort_keys=False, width=1000)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, f"{HEAD.format(name=name)}{text}".encode())
-    return path
+    sys.stdout.write(
+        f"{path} has {len(rows)} rows; run them with\n"
+        f"rgbt reproduce table={name} seeds=3 workers=2\n"
+    )
+    return 0

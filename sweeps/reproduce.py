@@ -22,7 +22,7 @@ from sweeps.settings import SweepSettings
 
 if TYPE_CHECKING:
     from sweeps.plan.planner import Planner
-    from sweeps.plan.request import RowSeed, TableRequest
+    from sweeps.plan.request import TableRequest
     from sweeps.point import Outcome
     from sweeps.run.run_store import RunStore
 
@@ -89,7 +89,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.compose import compose
     from rgbt.config.overrides import composing
     from sweeps.plan.planner import Planner
-    from sweeps.plan.request import check_override
+    from sweeps.plan.request import check_overrides
     from sweeps.run.run_store import open_run_store
 
     of_hydra = [word for word in overrides if word.startswith(HYDRA)]
@@ -101,127 +101,133 @@ def main(options: Options, overrides: list[str]) -> int:
                 "hydra.searchpath=... are possible here; workers=2 etc. are options."
             )
     settings = settings_of(options, of_hydra)
-    for word in others:
-        check_override(word)
+    check_overrides(others)
     of_tracker = [word for word in others if word.lstrip("+~").startswith("tracking")]
     words = [word for word in others if word not in of_tracker]
     base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *of_tracker)
     with composing(base):
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
-    runs, planner = open_run_store(config), Planner(base)
-    if options.table == "all" or "," in options.table:
-        return reproduce_several(options, words, settings, runs, planner)
-    return reproduce_one(options, words, settings, runs, planner)
+    return run_tables(options, words, settings, open_run_store(config), Planner(base))
 
 
-def request_of(options: Options, name: str, words: Sequence[str], planner: Planner) -> TableRequest:
-    """Return the table `name` as it was requested; `words` are overrides of every row.
-
-    InputError: an option or a word that does not fit the table, rows that would be one run, or
-    seeds=until_decided of a table without claims.
-    """
-    from sweeps.judge.until_decided import START
-    from sweeps.plan.request import (
-        TableRequest,
-        make_request,
-        read_named,
-        row_digests,
-        seeds_of,
-    )
-
-    adds, both = options.seeds == "until_decided", options.form == "both"
-    typed = TableRequest(
-        *read_named(name),
-        options.scale,
-        tuple(range(START)) if adds else seeds_of(options.seeds),
-        tuple(words),
-        form="released" if options.form == "released" else "paper",
-        until_decided=adds,
-    )
-    request = make_request(typed, options.rows, both=both, planner=planner)
-    if request.deciding_words():
-        request = replace(request, digests=row_digests(request, planner))
-    if adds and not request.table.claims:
-        raise InputError(
-            f"seeds=until_decided: {request.name} has no claims with these rows; give a number of "
-            "seeds, or add claims to the table."
-        )
-    return request
-
-
-def reproduce_one(
+def run_tables(
     options: Options,
     words: Sequence[str],
     settings: SweepSettings,
     runs: RunStore,
     planner: Planner,
 ) -> int:
-    """Run what one table lacks, and publish it; 1 if a cell failed or has no value."""
+    """Run what the requested tables lack, and publish a single one; `words` are of every row.
+
+    Returns:
+        1 if a run failed, or a cell of a single table has no value; else 0.
+    """
     from sweeps.judge.judged_table import JudgedTable
     from sweeps.judge.until_decided import SeedsUntilDecided
-    from sweeps.run.point_list import PointList, commands_line, preview_points, run_points
+    from sweeps.queue import Queue
+    from sweeps.run.point_list import commands_line, preview_points, run_points
     from sweeps.score.efficiency import network_sizes
     from sweeps.score.external import evaluate_external
     from sweeps.show.publish import print_preview, publish_table
 
-    request = request_of(options, options.table, words, planner)
-    sizes = {} if options.dry_run else network_sizes(request)
-    judged = JudgedTable(request=request, sizes=sizes)
-    external: dict[RowSeed, Outcome] = {}
-    seeds = SeedsUntilDecided(judged, options.max_seeds, external)
-    points = PointList(
-        request.study,
-        f"{request.name} scale={request.scale}",
-        tuple(request.points()),
-        runs,
-        planner,
-        more=seeds if request.until_decided else None,
-    )
+    tables = []
+    for request in requested_tables(options, words, planner):
+        external = {}
+        if settings.commands is None and not settings.dry_run:
+            external = evaluate_external(request, planner.base, runs.runs_dir, options.trust)
+        tables.append(SeedsUntilDecided(JudgedTable(request=request), options.max_seeds, external))
+    if is_several(options):
+        runs.archive = options.archive
+    queue = Queue(tables, runs, planner, is_dry=settings.dry_run)
+    points = queue.point_list(is_ranked=is_several(options))
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0
+    outcomes: list[Outcome] | None = []
     if settings.dry_run:
-        print_preview(request, preview_points(points, settings), settings.workers or 1)
-        return 0
-    external |= evaluate_external(request, planner.base, runs.runs_dir, options.trust)
-    outcomes = run_points(points, settings) if points.points else []
+        outcomes = preview_points(points, settings)
+    elif points.points:
+        outcomes = run_points(points, settings)
     if outcomes is None:
         return 0
-    judged = replace(judged, runs={**request.runs(outcomes), **external})
+    if is_several(options):
+        return queue.report(outcomes)
+    (table,) = tables
+    request = table.judged.request
+    if settings.dry_run:
+        print_preview(request, outcomes, settings.workers or 1)
+        return 0
+    judged = replace(
+        table.judged,
+        runs={**request.runs(outcomes), **table.external},
+        sizes=network_sizes(request),
+    )
     out = options.out or options.runs_dir / "tables" / f"{request.name}_{request.variant}"
     return publish_table(judged, outcomes, out)
 
 
-def reproduce_several(
-    options: Options,
-    words: Sequence[str],
-    settings: SweepSettings,
-    runs: RunStore,
-    planner: Planner,
-) -> int:
-    """Run what several tables lack until the time is over; 1 if a run failed.
+def is_several(options: Options) -> bool:
+    """Return whether several tables were requested, whose runs are ordered and archived."""
+    return options.table == "all" or "," in options.table
 
-    A table that cannot be trained with these options is left out with a line.
+
+def requested_tables(
+    options: Options, words: Sequence[str], planner: Planner
+) -> list[TableRequest]:
+    """Return the tables; of several, one that cannot be trained is left out with a line.
+
+    InputError: an option or a word does not fit the table, or none of several can be trained.
     """
-    from sweeps.plan.table import study_names, table_names
-    from sweeps.queue import check_trainable, run_queue
+    from sweeps.plan.table import PUBLISHED, STUDIES, table_names
 
-    every = [*table_names(Path("none")), *study_names()]
-    names = every if options.table == "all" else split_list(options.table, "tables")
+    if not is_several(options):
+        return [_request(options, options.table, words, planner)]
+    is_all = options.table == "all"
+    names = table_names(PUBLISHED, STUDIES) if is_all else split_list(options.table, "tables")
     requests = []
     for name in names:
         try:
-            request = request_of(options, name, words, planner)
-            check_trainable(request, planner)
+            request = _request(options, name, words, planner)
+            _check_trainable(request, planner)
         except InputError as error:
             info(f"{name} is left out: {error}")
         else:
             requests.append(request)
     if not requests:
         raise InputError(f"table={options.table}: none of them can be trained.")
-    runs.archive = options.archive
-    return run_queue(requests, settings, runs, planner, options.max_seeds)
+    return requests
+
+
+def _request(options: Options, name: str, words: Sequence[str], planner: Planner) -> TableRequest:
+    from sweeps.judge.until_decided import START
+    from sweeps.plan.request import make_request, row_digests, seeds_of
+
+    is_adding = options.seeds == "until_decided"
+    seeds = tuple(range(START)) if is_adding else seeds_of(options.seeds)
+    request = make_request(
+        name, options.scale, words, form=options.form, rows=options.rows, planner=planner
+    )
+    if is_adding and not request.table.claims:
+        raise InputError(
+            f"seeds=until_decided: {request.name} has no claims with these rows; give a number of "
+            "seeds, or add claims to the table."
+        )
+    digests = row_digests(request, planner)
+    return replace(request, seeds=seeds, until_decided=is_adding, digests=digests)
+
+
+def _check_trainable(request: TableRequest, planner: Planner) -> None:
+    """Refuse a table of which no row can be trained, with the reason of the first row."""
+    reason = InputError("none of its rows is trained.")
+    for point in reversed(request.points()):
+        try:
+            planner.plan(point)
+        except InputError as error:
+            reason = error
+        else:
+            return
+    raise reason
 
 
 def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings:

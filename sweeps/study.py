@@ -35,8 +35,7 @@ OF_TRIAL = ("trial", "state", "label")
 # Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth.
 MIN_TRIALS = 10
 
-# Rows of the table of best trials; the CSV has all.
-TOP = 10
+TOP = 10  # rows of the table of best trials; the CSV has all
 
 # Scores that are shown also where they are no objective.
 ALWAYS = (metric_names.MIOU, metric_names.VAR)
@@ -194,7 +193,6 @@ def importances(study: optuna.Study, trials: pd.DataFrame) -> tuple[TextTable | 
 
 
 def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) -> TextTable:
-    """Write columns of a frame, some under other names, as text."""
     import pandas as pd
 
     def text(name: str, value: object) -> str:
@@ -220,21 +218,16 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     important, remark = importances(study, trials)
     grids += [important] if important else []
     out.mkdir(parents=True, exist_ok=True)
-    ways = []
-    for metric, is_up in objectives(study).items():
-        ways.append(f"{'highest' if is_up else 'lowest'} {metric}")
-    command = without_passwords(study.user_attrs.get(names.COMMAND, ""))
-    remarks = [f"Importances: {remark}"] if remark else []
-    text = [
-        f"# Study {study.study_name}",
-        f"Objectives: {', '.join(ways)}.",
-        *([f"Created by `{command}`."] if command else []),
-        *(grid.to_markdown() for grid in grids),
-        *remarks,
-    ]
+    ways = [f"{'highest' if up else 'lowest'} {name}" for name, up in objectives(study).items()]
+    text = [f"# Study {study.study_name}", f"Objectives: {', '.join(ways)}."]
+    if command := without_passwords(study.user_attrs.get(names.COMMAND, "")):
+        text.append(f"Created by `{command}`.")
+    text += [grid.to_markdown() for grid in grids]
+    said = f"Importances: {remark}" if remark else ""
+    text += [said] if said else []
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
     write_atomic(out / "trials.csv", trials.to_csv(index=False).encode())
-    print_rich(Group(*map(rich_table, grids), plain_text("\n".join(remarks))))
+    print_rich(Group(*map(rich_table, grids), plain_text(said)))
     lines = [("report", str(out / "study.md"))]
     if find_spec("optuna_dashboard"):
         lines.append(("figures", f"optuna-dashboard {without_passwords(url)}"))

@@ -158,8 +158,7 @@ def test_no_command_composes_a_stored_word(
     monkeypatch.chdir(root)
     monkeypatch.syspath_prepend(str(root))
     monkeypatch.setenv("TOKEN", SECRET)
-    monkeypatch.setattr(stored_tables, "table_names", lambda: [TABLE])
-    monkeypatch.setattr(stored_tables, "study_names", list)
+    monkeypatch.setattr(stored_tables, "table_names", lambda *_: [TABLE])
     composed: list[str] = []
     divided = compose._divided
 

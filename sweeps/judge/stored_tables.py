@@ -14,7 +14,16 @@ from rgbt.runs.result import RunResult
 from sweeps.judge.judged_table import RESAMPLES, JudgedTable
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, RowSeed, TableRequest
-from sweeps.plan.table import RELEASED, Form, Table, load_table, study_names, table_names
+from sweeps.plan.table import (
+    OWN,
+    PUBLISHED,
+    RELEASED,
+    STUDIES,
+    Form,
+    Table,
+    load_table,
+    table_names,
+)
 from sweeps.point import Outcome, Point
 from sweeps.score.efficiency import network_sizes
 from sweeps.score.reader import ODD, SEED, RunReader
@@ -59,7 +68,7 @@ def runs_of_request(
 def known_tables(remarks: list[str]) -> dict[str, Table]:
     """Read all tables of the papers, of ours, and of the user; one that is not read is a remark."""
     tables = {}
-    for name in dict.fromkeys([*table_names(), *study_names()]):
+    for name in dict.fromkeys(table_names(PUBLISHED, OWN, STUDIES)):
         try:
             tables[name] = load_table(name)
         except InputError as error:

@@ -20,13 +20,11 @@ Range = tuple[float, float]
 HIGHER: Range = (0.0, math.inf)
 LOWER: Range = (-math.inf, 0.0)
 
-STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
-
 
 class Strict:
     """A part of a table file: unknown keys, NaN and infinity are refused."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 def check_different(names: Sequence[str]) -> None:

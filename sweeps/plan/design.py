@@ -175,7 +175,6 @@ class Design(Strict):
                 }
 
     def _free_letters(self, part: Part) -> list[str]:
-        """Return the letters of the factors whose level no generator gives."""
         return [letter for letter in self.letters if letter not in part.generators]
 
     @model_validator(mode="after")

@@ -70,7 +70,6 @@ def counts_of(result: RunResult, words: Words) -> Counts:
 
 
 def _is_same(found: Measurement, wanted: Measurement) -> bool:
-    """Whether a stored measurement is the one that a table wants."""
     if wanted.dataset_words:  # they say which images these are
         return set(wanted.differences(found)) <= {"dataset"}
     protocol = protocol_of(wanted.partition)

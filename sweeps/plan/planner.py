@@ -33,7 +33,7 @@ class PlannedPoint:
     def outcome(
         self, state: State, reason: str = "", results: tuple[RunResult, ...] = ()
     ) -> Outcome:
-        """Return the outcome of this point (`Outcome`)."""
+        """Return an outcome of this point."""
         return Outcome(self.point, state, reason, results, tuple(run.key for run in self.runs))
 
 

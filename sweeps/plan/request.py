@@ -22,13 +22,13 @@ from sweeps.plan.measurement import Words
 from sweeps.plan.planner import Planner
 from sweeps.plan.table import (
     PUBLISHED,
+    STUDIES,
     Form,
     Row,
     Table,
     is_counted,
     load_table,
     metric_of,
-    study_names,
     table_names,
     table_path,
     words_of,
@@ -42,8 +42,8 @@ TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
 PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
 TAG_LENGTH = 5000
 
-# Prefix of the tag that says how the rows were requested, where that is not plainly: their form,
-# the digest of the settings of the row alone, and the words that were typed for all rows.
+# Prefix of the tag with the form of the rows, the digest of the settings of the row alone, and the
+# words that were typed for all rows; without words, the paper's form has none.
 REQUESTED = "rgbt.requested/"
 
 # Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
@@ -89,7 +89,7 @@ class TableRequest:
     name: str
     table: Table
     scale: str
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...] = (0,)
     extra: tuple[str, ...] = ()
     pretrained: Mapping[str, str] = field(default_factory=dict)
     form: Form = "paper"
@@ -100,7 +100,7 @@ class TableRequest:
 
     def overrides(self, label: str, seed: int) -> tuple[str, ...]:
         """Return the overrides of the run of row `label` with that seed."""
-        (row,) = (row for row in self.table.rows if row.label == label)
+        row = row_named(label, self.table)
         experiment, *others = self.table.overrides(row, self.scale, self.form)
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
         file = self.pretrained.get(_model_of(others))
@@ -128,14 +128,9 @@ class TableRequest:
         points = []
         for overrides, labels in sharing.items():
             more = f" (and {len(labels) - 1} more)" if len(labels) > 1 else ""
-            points.append(
-                Point(
-                    f"{labels[0]}{more} {overrides[-1]}",
-                    overrides,
-                    tags=self.tags(labels),
-                    evaluations=self.evaluations(labels),
-                )
-            )
+            label = f"{labels[0]}{more} {overrides[-1]}"
+            evaluations = self.evaluations(labels)
+            points.append(Point(label, overrides, {}, self.tags(labels), evaluations=evaluations))
         return points
 
     def tags(self, labels: Sequence[str]) -> dict[str, str]:
@@ -149,14 +144,9 @@ class TableRequest:
             tags[REQUESTED + self.name] = shlex.join(how)
         return tags
 
-    def evaluations(self, labels: Collection[str] | None = None) -> tuple[Words, ...]:
-        """Return the measurements that the rows `labels` need beside the test of their runs.
-
-        None: all rows that are run.
-        """
-        rows = self.table.runnable_rows
-        if labels is not None:
-            rows = [row for row in rows if row.label in labels]
+    def evaluations(self, labels: Collection[str]) -> tuple[Words, ...]:
+        """Return the measurements that the rows `labels` need beside the test of their runs."""
+        rows = [row for row in self.table.runnable_rows if row.label in labels]
         names = {column.name for row in rows for column in self.table.columns_of(row)}
         needed: dict[Words, None] = {}
         for column in self.table.columns:
@@ -212,18 +202,37 @@ class TableRequest:
 
 
 def make_request(
-    request: TableRequest, rows: str = "", *, both: bool = False, planner: Planner | None = None
+    name: str,
+    scale: str,
+    words: Sequence[str] = (),
+    *,
+    form: str = "paper",
+    rows: str = "",
+    planner: Planner | None = None,
 ) -> TableRequest:
-    """Complete a request as it was typed, whose `extra` are all overrides.
+    """Read a table and what was typed for it, for seed 0.
 
-    Its rows are selected (``rows=...``), `both` forms are compared, and the words
-    pretrained.NETWORK=FILE, weights.ROW=FILE and predictions.ROW=FOLDER are read. With a `planner`,
-    rows that would be one run are refused; a test has compared those of the project as they are.
+    Its rows are selected (``rows=...``), both forms are compared (``form=both``), and of `words`,
+    pretrained.NETWORK=FILE, weights.ROW=FILE and predictions.ROW=FOLDER are read; the others are
+    overrides of every row. With a `planner`, rows that would be one run are refused; a test has
+    compared those of the project as they are.
+
+    InputError: a word that does not fit the table, or a file with the name of a published table.
     """
-    check_choice("scale", request.scale, available("scale"))
-    table = select_rows(request.table, rows) if rows else request.table
-    table = table.both_forms() if both else table
-    external, others = external_rows(request.extra, table)
+    check_choice("scale", scale, available("scale"))
+    table, published = load_table(name), table_names(PUBLISHED)
+    if name.endswith((".yaml", ".yml")):
+        path = table_path(name).resolve()
+        name = f"{table.paper}/{path.stem}"
+        if name in published and not path.is_relative_to(PUBLISHED):
+            raise InputError(f"table={path}: '{name}' is a published table; change `paper`.")
+    chosen = [f"rows={rows}"] if rows else []
+    if rows:
+        table = select_rows(table, rows)
+    if form == "both":
+        table = table.both_forms()
+        chosen.append("form=both")
+    external, others = external_rows(words, table)
     extra: list[str] = []
     pretrained: dict[str, str] = {}
     for word in others:
@@ -232,44 +241,31 @@ def make_request(
             pretrained[model] = file
         else:
             extra.append(word)
-    chosen = [f"rows={rows}"] if rows else []
-    chosen += ["form=both"] if both else []
-    made = replace(
-        request,
-        table=table,
+    request = TableRequest(
+        name,
+        table,
+        scale,
         extra=tuple(extra),
         pretrained=pretrained,
+        form="released" if form == "released" else "paper",
         external=tuple(external),
         chosen=tuple(chosen),
     )
-    known = {_model_of(table.overrides(row, made.scale, made.form)) for row in table.runnable_rows}
+    known = {_model_of(table.overrides(row, scale, request.form)) for row in table.runnable_rows}
     for model in pretrained:
-        what = f"{PRETRAINED}NETWORK of {request.name} at scale={request.scale}"
-        check_choice(what, model, known - {""})
-    is_tested = request.name in (*table_names(Path("none")), *study_names())
-    if planner is not None and (made.typed_overrides() or made.external or not is_tested):
-        check_equal_runs(made, planner)
-    return made
+        check_choice(f"{PRETRAINED}NETWORK of {name} at scale={scale}", model, known - {""})
+    is_tested = name in (*published, *table_names(STUDIES))
+    if planner is not None and (request.typed_overrides() or external or not is_tested):
+        check_equal_runs(request, planner)
+    return request
 
 
-def read_named(name: str) -> tuple[str, Table]:
-    """Read a table, and return the name that its records get before it.
-
-    InputError: there is no such table (`load_table`), or a file has the name of a published one.
-    """
-    table, path = load_table(name), table_path(name).resolve()
-    if name.endswith((".yaml", ".yml")):
-        name = f"{table.paper}/{path.stem}"
-        if name in table_names(Path("none")) and not path.is_relative_to(PUBLISHED):
-            raise InputError(f"table={path}: '{name}' is a published table; change `paper`.")
-    return name, table
-
-
-def check_override(word: str) -> None:
-    """Refuse an override that belongs to the rows or columns of a table."""
-    key = word.lstrip("+~").partition("=")[0].rpartition("@")[2].partition(".")[0]
-    if key in ROW_SETTINGS:
-        raise InputError(f"'{word}': {ROW_SETTINGS[key]}")
+def check_overrides(words: Sequence[str]) -> None:
+    """Refuse overrides that belong to the rows or columns of a table."""
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0].rpartition("@")[2].partition(".")[0]
+        if key in ROW_SETTINGS:
+            raise InputError(f"'{word}': {ROW_SETTINGS[key]}")
 
 
 def row_named(word: str, table: Table) -> Row:
@@ -293,12 +289,7 @@ def select_rows(table: Table, text: str) -> Table:
         group = {row.label for row in table.rows if row.group == word}
         chosen |= group or {row_named(word, table).label}
     origin = _origins(table)
-    first: dict[str, str] = {}
-    rows = []
-    for row in table.rows:
-        if row.label in chosen:
-            same = first.setdefault(origin[row.label], row.label)
-            rows.append(replace(row, same_as=None if same == row.label else same))
+    rows = [replace(row, same_as=origin[row.label]) for row in table.rows if row.label in chosen]
 
     # "Better than all others" is another statement where some of the others are missing.
     claims = table.claims
@@ -358,8 +349,11 @@ def check_equal_runs(request: TableRequest, planner: Planner) -> None:
 def row_digests(request: TableRequest, planner: Planner) -> dict[str, str]:
     """Return the digest of the settings of every trained row, without what was typed for all.
 
-    By it a report knows whether a row is the one of today, without composing the words of a run.
+    By it a report knows whether a row is the one of today, without composing the words of a run. It
+    is recorded with these words alone: without them there are no digests.
     """
+    if not request.deciding_words():
+        return {}
     alone = replace(request, extra=(), pretrained={})
     rows = request.trained_rows
     return {row.label: planner.row_digest(alone.overrides(row.label, 0)) for row in rows}
@@ -385,14 +379,13 @@ def seeds_of(text: str) -> tuple[int, ...]:
 
 
 def _origins(table: Table) -> dict[str, str]:
-    """Return the first of the rows that may be the same run, by the label of each row."""
     origin: dict[str, str] = {}
     for row in table.rows:
-        origin[row.label] = origin.get(row.same_as or "", row.label)
+        same = row.same_as or row.label  # perhaps a row that was not selected
+        origin[row.label] = origin.get(same, same)
     return origin
 
 
 def _model_of(overrides: Sequence[str]) -> str:
-    """Return the network that is chosen last, or ""."""
     named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
     return named[-1] if named else ""

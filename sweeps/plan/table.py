@@ -208,7 +208,7 @@ class Table(Strict):
         return replace(self, rows=(*self.rows, *(Row(**row) for row in of_design)))
 
     @model_validator(mode="after")
-    def _check_names(self) -> Table:
+    def _check(self) -> Table:
         check_different([column.name for column in self.columns])
         check_different([row.label for row in self.rows])
         check_different([claim.name for claim in self.claims])
@@ -218,10 +218,13 @@ class Table(Strict):
                 check_choice("at", scale, available("scale"))
         if self.regions != "as trained":
             check_choice("regions", self.regions, available("metric"))
+        self._check_columns()
+        self._check_rows()
+        for claim in self.claims:
+            self._check_claim(claim)
         return self
 
-    @model_validator(mode="after")
-    def _check_columns(self) -> Table:
+    def _check_columns(self) -> None:
         known = [column.name for column in self.columns if is_counted(column)]
         for column in self.columns:
             for name in column.sources:  # they are computed in order
@@ -230,10 +233,8 @@ class Table(Strict):
                 known.append(column.name)
         for name in self.design.outcomes if self.design else ():
             check_choice("design.outcomes", name, self._names)
-        return self
 
-    @model_validator(mode="after")
-    def _check_rows(self) -> Table:
+    def _check_rows(self) -> None:
         printed = [column.name for column in self.columns if column.printed]
         metrics = [column.metric for column in self.columns if column.metric is not None]
         earlier: list[str] = []
@@ -250,38 +251,26 @@ class Table(Strict):
                 for key in re.findall(r"{(\w+)}", metric):
                     check_choice(f"{where}, settings for '{metric}'", key, row.settings)
                 parse(metric.format_map(row.settings))
-        return self
 
-    @model_validator(mode="after")
-    def _check_claims(self) -> Table:
-        labels = [row.label for row in self.rows]
-        for claim in self.claims:
-            where = f"claim '{claim.name}'"
-            if claim.effect:
-                self._check_effect(claim, where)
-                continue
-            against = () if claim.against in ((OTHERS,), (PREVIOUS,)) else claim.against
-            for label in (*claim.rows, *against):
-                check_choice(f"{where}, rows", label, labels)
-            minus = () if claim.minus_column is None else (claim.minus_column,)
-            for name in (*claim.columns, *minus):
-                check_choice(f"{where}, columns", name, self._names)
-            if not claim.columns or not list(claim.pairs(labels)):
-                raise ValueError(f"{where}: there is nothing to compare.")
-        return self
-
-    def _check_effect(self, claim: Claim, where: str) -> None:
-        """Refuse a claim about what is not in the design."""
-        design = self.design
-        methods = [method.name for method in design.methods] if design else []
-        for name in claim.rows:
-            check_choice(f"{where}, methods", name, methods)
-        for name in claim.columns:
-            check_choice(f"{where}, outcomes", name, design.outcomes if design else ())
-        for letter in claim.effect:
-            check_choice(f"{where}, effect", letter, design.letters if design else ())
-        if design and claim.part:
-            check_choice(f"{where}, part", claim.part, design.parts)
+    def _check_claim(self, claim: Claim) -> None:
+        where, design = f"claim '{claim.name}'", self.design
+        labels, names = [row.label for row in self.rows], self._names
+        if claim.effect:
+            if design is None:
+                raise ValueError(f"{where}: an effect is one of a design.")
+            labels, names = [method.name for method in design.methods], list(design.outcomes)
+            for letter in claim.effect:
+                check_choice(f"{where}, effect", letter, design.letters)
+            if claim.part:
+                check_choice(f"{where}, part", claim.part, design.parts)
+        against = () if claim.against in ((OTHERS,), (PREVIOUS,)) else claim.against
+        for label in (*claim.rows, *against):
+            check_choice(f"{where}, rows", label, labels)
+        minus = () if claim.minus_column is None else (claim.minus_column,)
+        for name in (*claim.columns, *minus):
+            check_choice(f"{where}, columns", name, names)
+        if not claim.columns or not list(claim.pairs(labels)):
+            raise ValueError(f"{where}: there is nothing to compare.")
 
     @property
     def _names(self) -> list[str]:
@@ -339,28 +328,24 @@ class Table(Strict):
                 replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
             )
             for column in compared:
-                if column in self.columns_of(row):
-                    claims.append(_released_is_higher(row, column))
+                if column not in self.columns_of(row):
+                    continue
+                claim = Claim(
+                    name=f"{label}, {column.name}",
+                    says=f"{row.label}: the released form has a higher {column.name}.",
+                    source="form=both",
+                    rows=(label,),
+                    against=(row.label,),
+                    columns=(column.name,),
+                    expected="higher",
+                )
+                claims.append(claim)
         if not claims:
             raise InputError(
                 f"form=both: no row of {self.paper}, {self.number} has a released form of its own; "
                 "use form=paper."
             )
         return replace(self, rows=tuple(rows), claims=tuple(claims))
-
-
-def _released_is_higher(row: Row, column: Column) -> Claim:
-    """Return the claim that form=both judges of a row and column."""
-    label = f"{row.label}{RELEASED}"
-    return Claim(
-        name=f"{label}, {column.name}",
-        says=f"{row.label}: the released form has a higher {column.name}.",
-        source="form=both",
-        rows=(label,),
-        against=(row.label,),
-        columns=(column.name,),
-        expected="higher",
-    )
 
 
 def metric_of(column: Column, row: Row) -> str:
@@ -397,40 +382,34 @@ def is_counted(column: Column) -> bool:
     return column.metric is not None
 
 
-def table_names(folder: Path = OWN) -> list[str]:
-    """Return the names for `load_table`: the papers' tables, then those in `folder`."""
+def table_names(*folders: Path) -> list[str]:
+    """Return the names for `load_table` of the tables in folders."""
     names = []
-    for root in (PUBLISHED, folder):
-        for path in sorted(root.rglob("*.yaml")):
-            names.append(path.relative_to(root).with_suffix("").as_posix())
+    for folder in folders:
+        for path in sorted(folder.rglob("*.yaml")):
+            names.append(path.relative_to(folder).with_suffix("").as_posix())
     return names
 
 
-def study_names() -> list[str]:
-    """Return the names for `load_table` of our own studies."""
-    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
-
-
-def table_path(name: str, folder: Path = OWN) -> Path:
+def table_path(name: str) -> Path:
     """Find the file of a table; InputError: no such table, or two of that name.
 
-    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one in
-    the `folder` of the user's tables; or a path that ends in .yaml.
+    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one of
+    the user; or a path that ends in .yaml.
     """
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
-    places = [root / f"{name}.yaml" for root in (PUBLISHED, STUDIES, folder)]
-    paths = [path for path in places if path.is_file()]
+    folders = (PUBLISHED, STUDIES, OWN)
+    paths = [folder / f"{name}.yaml" for folder in folders if (folder / f"{name}.yaml").is_file()]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
-        known = [*table_names(folder), *study_names()]
-        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
+        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(*folders))}.")
     return paths[0]
 
 
-def load_table(name: str, folder: Path = OWN) -> Table:
+def load_table(name: str) -> Table:
     """Read and check a table (see `table_path`); InputError names its file and the wrong key."""
-    path = table_path(name, folder)
+    path = table_path(name)
     table: Table = check_value(str(path), read_yaml(path), Table)
     return table

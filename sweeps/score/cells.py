@@ -114,7 +114,6 @@ def is_of_runs(column: Column) -> bool:
 def _row_cells(
     table: Table, row: Row, outcomes: Mapping[int, Outcome], reader: Reader
 ) -> dict[CellId, TableCell]:
-    """Return the cells of one row, whose runs are given by seed, in columns with values of runs."""
     if not outcomes:
         return {}
     by_seed = {seed: _values(table, row, outcome, reader) for seed, outcome in outcomes.items()}
@@ -132,7 +131,6 @@ def _row_cells(
 
 
 def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[str, Value]:
-    """Return every column's value of one run."""
     counts: dict[Words, Counts | str] = {}
     values: dict[str, Value] = {}
     columns = table.columns_of(row)
@@ -149,7 +147,6 @@ def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[st
 
 
 def _counts(outcome: Outcome, words: Words, reader: Reader) -> Counts | str:
-    """Return the counts of a measurement, or the reason why there are none."""
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
     run = outcome.results[0]

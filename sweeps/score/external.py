@@ -57,10 +57,8 @@ def evaluate_external(
     """
     outcomes: dict[RowSeed, Outcome] = {}
     for given in request.external:
-        outcome = ExternalRun.of(given, request, base, runs_dir).outcome(request.table, trust)
-        if outcome.state == "failed":
-            raise InputError(f"row '{given.label}': {outcome.reason}")
-        outcomes[given.label, FIXED] = outcome
+        run = ExternalRun.of(given, request, base, runs_dir)
+        outcomes[given.label, FIXED] = run.outcome(request.table, trust)
     return outcomes
 
 
@@ -125,8 +123,8 @@ class ExternalRun:
     def outcome(self, table: Table, trust: str) -> Outcome:
         """Make the counts that columns of `table` need and lack, and return the outcome.
 
-        It is "failed" if there are none. A measurement that fails beside others is the reason of
-        its columns alone.
+        A measurement that fails beside others is the reason of its columns alone. InputError: all
+        fail.
         """
         needed: dict[Words, None] = {}
         for column in table.columns_of(self.row):
@@ -136,8 +134,7 @@ class ExternalRun:
         reasons: dict[Words, str] = {}
         # Plain images first: other measurements of single frames are found by comparison with them.
         has_images = not all(_of_frames(words) for words in needed)
-        wanted: dict[Words, None] = {(): None} if has_images else {}
-        for words in wanted | needed:
+        for words in ({(): None} if has_images else {}) | needed:
             if () in reasons:  # nothing else can be made of it
                 reasons[words] = reasons[()]
             elif not self._has(result, words):
@@ -145,9 +142,10 @@ class ExternalRun:
                 info(f"row '{self.row.label}': evaluating {self.given.path} ({what})")
                 if reason := self._make(result, words, trust):
                     reasons[words] = reason
-        point = Point(self.row.label, ())
         if all(words in reasons for words in needed):
-            return Outcome(point, "failed", next(iter(reasons.values()), "no column is a score"))
+            reason = next(iter(reasons.values()), "no column is a score")
+            raise InputError(f"row '{self.row.label}': {reason}")
+        point = Point(self.row.label, ())
         return Outcome(point, "finished", results=(result,), missing=reasons)
 
     def _has(self, result: RunResult, words: Words) -> bool:
@@ -162,10 +160,9 @@ class ExternalRun:
         log = self.folder / "log.txt"
         folders = ",".join(filter(None, (own_folders(), str(self.folder / "conf"))))
         with tempfile.TemporaryDirectory(dir=self.folder) as made:
-            is_one = command[0] == "rgbt.evaluate"
+            out = f"out={made}/{OWN}" if command[0] == "rgbt.evaluate" else f"out={made}"
             own = [f"trust={trust}"] if trust and self.given.kind == "weights" else []
             with searching([f"{SEARCH_PATH}=[{folders}]"]):
-                out = f"out={made}/{OWN}" if is_one else f"out={made}"
                 reason = run_command((*command, *own, out), log)
             found = sorted(Path(made).glob("*.npz"))
             if command[0] == "analysis.score":  # it cuts images in three ways
@@ -183,12 +180,12 @@ class ExternalRun:
     def _command(self, words: Words) -> tuple[Words, str]:
         """Return the command of a measurement without its output, or why there is none."""
         is_of_frames = _of_frames(words)
-        is_cut = any(word.startswith("regions=") for word in words)
-        regions = [] if is_cut else [f"metric={NODE_FILE}"]
         if self.given.kind == "weights":
-            of_network = regions if self.row.network and not is_of_frames else []
+            is_cut = any(word.startswith("regions=") for word in words)
+            is_usual = self.row.network and not is_of_frames and not is_cut
+            regions = [f"metric={NODE_FILE}"] if is_usual else []
             weights = f"model.weights={self.given.path}"
-            return (*command_of(words), *self.arguments, *of_network, weights), ""
+            return (*command_of(words), *self.arguments, *regions, weights), ""
         of_folder = (f"predictions={self.given.path}", *self.arguments)
         if is_of_frames:
             has_pairs = (self.given.path / PAIR_LIST).is_file()
@@ -201,7 +198,6 @@ class ExternalRun:
         return ("analysis.score", "resamples=0", f"regions={metric.regions}", *of_folder), ""
 
     def _metric(self, words: Words) -> Any:
-        """Return the node that says how a measurement cuts images into regions."""
         names = [word.removeprefix("regions=") for word in words if word.startswith("regions=")]
         return compose([f"metric={names[0]}"]).metric if names else self.config.metric
 

@@ -15,7 +15,7 @@ from analysis.archive import archived
 from rgbt.tracking.tracker import Tracking
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Point
-from sweeps.reproduce import Options, reproduce_several, settings_of
+from sweeps.reproduce import Options, run_tables, settings_of
 from sweeps.run import driver as drivers
 from sweeps.run.run_store import RunStore
 from tests.sweeps.fakes import (
@@ -65,7 +65,6 @@ class QuickPlanner(FakePlanner):
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sweeps.plan.table.study_names", list)
     # The scores of fake runs are not those of their counts.
     monkeypatch.setattr("analysis.archive.check_result", lambda _: None)
     write_table("one", ("crm", "baseline"), [("crm", "baseline")])
@@ -84,12 +83,12 @@ def run(
     chosen = Options(table=table, runs_dir=place / "runs", **options)
     runs, planner = RunStore(place / "runs", Tracking()), QuickPlanner()
     with driven_by(executor := FakeExecutor(behaviour), FakeView()):
-        code = reproduce_several(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
+        code = run_tables(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
     return code, [words[0].removeprefix("+experiment=") for words in executor.started()]
 
 
 def test_runs_that_decide_most_claims_a_minute_come_first(
-    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # cmx is needed by two claims of two runs each; with it, the other claims lack one run each.
     assert run(place) == (0, ["cmx", "rtfnet", "mfnet", "crm", "baseline"])
@@ -137,19 +136,16 @@ def test_a_failed_run_does_not_end_the_queue(place: Path) -> None:
     assert run(place, fail) == (1, []), "it is not repeated"
 
 
-def test_commands_are_in_the_order_of_the_queue(place: Path) -> None:
-    assert run(place, commands=place / "file") == (0, [])
-    lines = (place / "file").read_text().splitlines()
-    names = [line.partition("+experiment=")[2].split()[0] for line in lines]
-    assert names == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
-
-
-def test_dry_run_prints_the_order_with_minutes(
+def test_commands_and_dry_run_have_the_order_with_minutes(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    order = ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
+    assert run(place, commands=place / "file") == (0, [])
+    commands = (place / "file").read_text().splitlines()
+    assert [line.partition("+experiment=")[2].split()[0] for line in commands] == order
     assert run(place, dry_run=True) == (0, [])
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if "seed=0" in line]
-    assert [line[0] for line in lines] == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
+    assert [line[0] for line in lines] == order
     assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
     assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
     assert not (place / "runs").exists()
@@ -161,7 +157,7 @@ def test_dry_run_prints_the_order_with_minutes(
 def test_a_table_with_runs_of_another_machine_waits(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(place, table="my/two")[0] == 0
+    assert run(place, table="my/two,my/wrong")[0] == 0
     for archive in sorted((place / "results").glob("*.zip"))[1:]:
         archive.unlink()
     there = place / "there"

@@ -13,7 +13,6 @@ import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState, create_trial
 
-from rgbt.tables import TextTable
 from sweeps import attributes, study
 from sweeps.run.optuna_study import driving, storage_url, study_folder
 from sweeps.study import entry, importances, trials_frame
@@ -55,10 +54,6 @@ def add(
     to.add_trial(trial)
 
 
-def grid_of(made: optuna.Study) -> TextTable:
-    return study.trials_grid(made, trials_frame(made))
-
-
 def test_trials_grid_sorts_by_objective_direction() -> None:
     made = new_study("val/Var")
     results = {"val/Var": 8.0, "test/Var": 9.5, "val/mIoU": 50.0, "test/mIoU": 48.25}
@@ -66,7 +61,7 @@ def test_trials_grid_sorts_by_objective_direction() -> None:
     add(made, [8.0], params=first, results=results, seconds=61.6, runs=["a1"])
     for value in (*range(12, 22), 4.0):
         add(made, [float(value)], params={"masker.alpha": 0.25})
-    grid = grid_of(made)
+    grid = study.trials_grid(made, trials_frame(made))
     assert grid.title == "Best trials: lowest val/Var"
     assert grid.header == (
         *("trial", "alpha", "optimizer.lr", "head.lr", "val/Var", "test/Var", "val/mIoU"),
@@ -85,30 +80,25 @@ def test_pareto_front_of_five_points() -> None:
     size = {"params": {"size": "${px:64}"}, "pixels": 0.5}
     for values in ((50.0, 9.0), (55.0, 8.0), (60.0, 12.0), (54.0, 10.0), (40.0, 2.0)):
         add(made, values, **size)
-    grid = grid_of(made)
+    grid = study.trials_grid(made, trials_frame(made))
     assert [row[0] for row in grid.rows] == ["3", "2", "5"]
     values = [("32", "60.00", "12.00"), ("32", "55.00", "8.00"), ("32", "40.00", "2.00")]
     assert [row[1:4] for row in grid.rows] == values
 
 
-def test_tables_count_the_states_and_list_failures() -> None:
-    made = new_study("val/mIoU")
-    add(made, [51.0], runs=["k1"])
-    add(made, state="RUNNING")
-    add(made, state="FAIL", label="x", reason="by\nsignal | 9", runs=["r1", "r2"])
-    counts, best, failed = study.tables(made, trials_frame(made))
-    assert counts.rows == (("3", "1", "0", "1", "1", "0"),)
-    assert [row[0] for row in best.rows] == ["0"]
-    assert failed.rows == (("by signal | 9", "2", "x", "r1 r2"),)
-
-
-def test_trials_csv_has_all_trials_with_full_numbers(tmp_path: Path) -> None:
+def test_tables_count_the_states_and_the_csv_has_all_trials(tmp_path: Path) -> None:
     made = new_study("val/mIoU")
     add(made, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
     reported = {10: 1.0, 20: 2.0}
     add(made, state="PRUNED", params={"a.x": 0.2}, reported=reported, reason="at 20, low")
+    add(made, state="RUNNING")
+    add(made, state="FAIL", label="x", reason="by\nsignal | 9", runs=["r1", "r2"])
+    counts, best, failed = study.tables(made, trials_frame(made))
+    assert counts.rows == (("4", "1", "1", "1", "1", "0"),)
+    assert [row[0] for row in best.rows] == ["0"]
+    assert failed.rows == (("by signal | 9", "3", "x", "r1 r2"),)
     study.publish_study(made, tmp_path, "")
-    first, second = csv.DictReader((tmp_path / "trials.csv").open())
+    first, second, *_ = csv.DictReader((tmp_path / "trials.csv").open())
     assert float(first["val/mIoU"]) == 100 / 3
     assert list(first.values())[5:] == ["31.0", "2.5", "", "r", ""]
     assert list(second.values())[3:] == ["0.2", "", "", "", "20", "", "at 20, low"]
@@ -133,14 +123,13 @@ def test_importances_name_the_deciding_parameter() -> None:
 
 
 def test_importances_missing_have_a_reason() -> None:
-    few, fixed = (new_study("up") for _ in range(2))
-    for index in range(12):
-        add(fixed, [float(index)], params={"x": 0.5})
-    for index in range(9):
-        add(few, [float(index)], params={"x": index / 20})
-    found = [importances(made, trials_frame(made)) for made in (few, fixed)]
-    assert found[0] == (None, "they need 10 complete trials, and there are 9.")
-    assert found[1] == (None, "no parameter, or no objective, took two values.")
+    made = new_study("up")
+    for index in range(10):
+        reason = f"they need 10 complete trials, and there are {index}."
+        assert importances(made, trials_frame(made)) == (None, reason)
+        add(made, [float(index)], params={"x": 0.5})
+    reason = "no parameter, or no objective, took two values."
+    assert importances(made, trials_frame(made)) == (None, reason)
 
 
 @pytest.mark.parametrize("installed", [None, "optuna_dashboard"])

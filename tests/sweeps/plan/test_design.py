@@ -145,9 +145,8 @@ def test_design_refuses_parts_that_do_not_fit(
 
 
 def test_resolution_three_is_refused() -> None:
-    made = design({"N": "OC"}, "OCN")
     with pytest.raises(InputError, match="O cannot be told apart from CN"):
-        check_value("design", asdict(made), Design)
+        check_value("design", asdict(design({"N": "OC"}, "OCN")), Design)
 
 
 def test_study_of_the_spatial_bias_has_its_cells() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from fnmatch import fnmatch
 from functools import cache
-from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -17,11 +16,11 @@ from rgbt.config.overrides import composing
 from rgbt.runs.run_spec import RunSpec
 from sweeps.plan.planner import Planner, specify_run
 from sweeps.plan.request import TableRequest, check_equal_runs
-from sweeps.plan.table import Form, Row, Table, load_table, study_names, table_names
+from sweeps.plan.table import PUBLISHED, STUDIES, Form, Row, Table, load_table, table_names
 from sweeps.score.efficiency import million_parameters
 from tests.composed import specified
 
-TABLES = {name: load_table(name) for name in table_names(Path("none"))}
+TABLES = {name: load_table(name) for name in table_names(PUBLISHED)}
 FORMS: tuple[Form, ...] = get_args(Form)
 SLOW = pytest.mark.slow
 MANY_ROWS = {"multihead/table3", "multihead/table4"}
@@ -256,7 +255,7 @@ class Composed(Planner):
     ("name", "scale"),
     [
         pytest.param(name, scale, marks=[SLOW] if scale != "demo" or name in MANY_ROWS else [])
-        for name in (*TABLES, *study_names())
+        for name in (*TABLES, *table_names(STUDIES))
         for scale in ("demo", "bench", "paper")
     ],
 )

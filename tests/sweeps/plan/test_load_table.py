@@ -12,6 +12,8 @@ import yaml
 from rgbt.checks import InputError
 from sweeps.plan.table import STUDIES, Column, Row, Table, load_table
 
+pytestmark = pytest.mark.usefixtures("own_folder")
+
 SMALL: dict[str, Any] = {
     "paper": "my",
     "number": "1",
@@ -23,6 +25,11 @@ SMALL: dict[str, Any] = {
         {"label": "large", "settings": {"kind": "a"}, "values": {"mIoU": 61, "Var": None}},
     ],
 }
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sweeps.plan.table.OWN", tmp_path)
 
 
 def write(folder: Path, **changes: Any) -> Path:
@@ -48,7 +55,7 @@ def behind(**keys: Any) -> dict[str, Any]:
 
 def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
     write(tmp_path, number=1)
-    table = load_table("my/ablation", tmp_path)
+    table = load_table("my/ablation")
     assert table.number == "1"
     assert [row.label for row in table.rows] == ["small", "large"]
     assert (table.unit, table.regions, table.absent) == ("percent", "as trained", None)
@@ -113,7 +120,7 @@ def test_table_that_does_not_fit_is_refused(
 ) -> None:
     path = write(tmp_path, **changes)
     with pytest.raises(InputError, match=key) as raised:
-        load_table("my/ablation", tmp_path)
+        load_table("my/ablation")
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -123,12 +130,12 @@ def test_claim_about_a_part_that_its_design_lacks_is_refused(tmp_path: Path) -> 
     known = (STUDIES / "spatial_bias.yaml").read_text()
     path.write_text(known.replace("part: trained", "part: trainde"))
     with pytest.raises(InputError, match="part: 'trainde'.*did you mean 'trained'"):
-        load_table(str(path), tmp_path)
+        load_table(str(path))
 
 
 def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'spatialseg/table3'"):
-        load_table("spatialseg/tabel3", tmp_path)
+        load_table("spatialseg/tabel3")
     with pytest.raises(InputError, match="none.yaml"):
         load_table(str(tmp_path / "none.yaml"))
 
@@ -137,7 +144,7 @@ def test_user_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
     (tmp_path / "crm").mkdir()
     write(tmp_path).rename(tmp_path / "crm" / "table4.yaml")
     with pytest.raises(InputError, match="is both"):
-        load_table("crm/table4", tmp_path)
+        load_table("crm/table4")
 
 
 def test_table_overrides_precede_row_overrides() -> None:

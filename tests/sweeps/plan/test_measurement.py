@@ -190,12 +190,10 @@ def test_pairs_are_found_by_their_protocol(tmp_path: Path) -> None:
     other = replace(BASE, partition="aligned5", view="rgb")
     assert stored_at(stored(tmp_path / "other", rgb=other), ("frames=aligned",)) is None
 
-
-def test_pairs_may_be_all_that_there_is(tmp_path: Path) -> None:
-    run = stored(tmp_path / "run", pairs=replace(BASE, partition="aligned3"))
+    run = stored(tmp_path / "pairs", pairs=replace(BASE, partition="aligned3"))
     (run.folder / OWN).unlink()
     assert stored_at(run, ("frames=aligned",)) == "evaluations/pairs.npz"
-    assert stored_at(run, ("frames=released",)) is None
+    assert stored_at(run, ("frames=released",)) is None, "pairs may be all that there is"
     assert stored_at(RunResult(tmp_path), ("frames=aligned",)) is None
 
 

@@ -12,13 +12,13 @@ import pytest
 import yaml
 
 from sweeps.judge.contrasts import as_claimed, contrasts_of, printed_values
-from sweeps.plan.table import Row, load_table, table_names
+from sweeps.plan.table import PUBLISHED, Row, load_table, table_names
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
-OURS = {name: load_table(name) for name in table_names(Path("none"))}
+OURS = {name: load_table(name) for name in table_names(PUBLISHED)}
 
 of_reference = pytest.mark.skipif(
     not all((FOLDER / f"{paper}.yaml").is_file() for paper in PAPERS),
@@ -117,6 +117,6 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
                 assert any(f"{claim.at_most:g}" in remark for remark in claim.remarks), claim.name
             if name[0] in "cs" and found[f"{name} {claim.name}"] is False:
                 assert any("printed" in remark for remark in claim.remarks), claim.name
-    listed = {name.strip(): False for name in CONTRADICTED.split(",")}
+    listed: dict[str, bool | None] = {name.strip(): False for name in CONTRADICTED.split(",")}
     listed |= {name.strip(): None for name in NOT_PRINTED.split(",")}
     assert {key: word for key, word in found.items() if word is not True} == listed

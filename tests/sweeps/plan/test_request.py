@@ -16,7 +16,6 @@ from sweeps.plan.request import (
     check_equal_runs,
     external_rows,
     make_request,
-    read_named,
     seeds_of,
     select_rows,
 )
@@ -103,9 +102,7 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
         *("pretrained.mask2former_swin_t=/w/t=1.pth", "pretrained.mask2former_swin_b=b.pth"),
         "x=1",
     )
-    name, published = read_named("spatialseg/table7")
-    words = TableRequest(name, published, "paper", (0,), given)
-    wanted = make_request(words)
+    wanted = make_request("spatialseg/table7", "paper", words=given)
     assert wanted.external == ()
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
@@ -113,17 +110,15 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
     assert wanted.typed_overrides() == ("x=1", *given[:2])
-    misspelt = replace(words, extra=("pretrained.mask2former_swinb=x",))
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
-        make_request(misspelt)
+        make_request("spatialseg/table7", "paper", words=["pretrained.mask2former_swinb=x"])
 
 
 def test_form_and_rows_make_another_table() -> None:
-    name, published = read_named("spatialseg/table3")
-    plain = TableRequest(name, published, "demo", (0,))
-    released = replace(plain, form="released")
-    chosen = ((plain, ""), (plain, "Ny/4,Ny/8"), (released, ""))
-    made = [make_request(request, rows) for request, rows in chosen]
+    chosen = (("paper", ""), ("paper", "Ny/4,Ny/8"), ("released", ""))
+    made = [
+        make_request("spatialseg/table3", "demo", form=form, rows=rows) for form, rows in chosen
+    ]
     variants = [request.variant for request in made]
     assert variants[0] == "demo"
     assert variants[1].startswith("demo-")
@@ -134,9 +129,7 @@ def test_form_and_rows_make_another_table() -> None:
 
 
 def test_both_forms_are_compared_by_claims() -> None:
-    name, published = read_named("spatialseg/table3")
-    typed = TableRequest(name, published, "demo", (0,))
-    request = make_request(typed, "Ny/4,Ny/8", both=True)
+    request = make_request("spatialseg/table3", "demo", form="both", rows="Ny/4,Ny/8")
     labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
     assert [row.label for row in request.table.rows] == labels
     words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
@@ -174,32 +167,23 @@ def test_selected_rows_keep_their_claims() -> None:
     chosen = select_rows(made, "c,1")
     assert [row.label for row in chosen.rows] == ["a", "c"]
     assert [claim.name for claim in chosen.claims] == ["c_a"]
-    assert select_rows(made, "b").rows[0].same_as is None
     assert select_rows(made, "a,b,c").claims == made.claims
-
-
-def test_twins_of_a_row_left_out_stay_declared() -> None:
-    rows = (
-        Row(label="a", experiment="crm"),
-        Row(label="b", experiment="crm", same_as="a"),
-        Row(label="c", experiment="crm", same_as="b"),
-        Row(label="d, with comma", experiment="grbm"),
-    )
-    chosen = select_rows(table(rows), "b,c,4")
-    assert [(row.label, row.same_as) for row in chosen.rows] == [
-        *(("b", None), ("c", "b"), ("d, with comma", None)),
-    ]
     with pytest.raises(InputError, match="'e'"):
-        select_rows(table(rows), "e")
+        select_rows(made, "e")
 
 
 def test_undeclared_rows_of_one_run_are_refused() -> None:
-    first, third = (Row(label=label, experiment="baseline") for label in "ac")
+    first, third, fourth = (Row(label=label, experiment="baseline") for label in ("a", "c", "d, e"))
     same = Row(label="b", experiment="baseline", same_as="a")
+    request = TableRequest("own/t", table((first, third)), "demo")
     with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):
-        check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
-    third = replace(third, same_as="b")
-    check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
+        check_equal_runs(request, Planner())
+    declared = table((first, same, replace(third, same_as="b"), fourth))
+    # Twins of a row that is left out stay declared.
+    for rows in ("a,b,c", "b,c", "a,c"):
+        check_equal_runs(replace(request, table=select_rows(declared, rows)), Planner())
+    with pytest.raises(InputError, match="'b' and 'd, e'"):
+        check_equal_runs(replace(request, table=select_rows(declared, "b,c,4")), Planner())
 
 
 NAMED = table(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import TableRequest, make_request
-from sweeps.plan.table import load_table
+from sweeps.plan.request import make_request
 
 MISSING = "missing_image"
 
@@ -16,7 +15,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
     planner = Planner()
 
     def keys(name: str) -> dict[str, str]:
-        request = make_request(TableRequest(name, load_table(name), "demo", (0,)))
+        request = make_request(name, "demo")
         return {
             row.label: planner.specify(request.overrides(row.label, 0)).key
             for row in request.trained_rows
@@ -29,8 +28,9 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
         "Masks": ablation["(2)"],
         "CRM": ablation["Ours"],
     }
-    request = make_request(TableRequest(MISSING, load_table(MISSING), "demo", (0,)))
-    assert request.evaluations() == (("corruption=removed:rgb",), ("corruption=removed:thermal",))
+    for point in make_request(MISSING, "demo").points():
+        removed = (("corruption=removed:rgb",), ("corruption=removed:thermal",))
+        assert point.evaluations == removed
 
 
 @pytest.mark.slow
@@ -38,7 +38,7 @@ def test_missing_image_has_the_runs_of_crm_ablation() -> None:
 def test_self_training_is_compared_at_equal_steps_and_start(task: str) -> None:
     """All second stages of one head start from one run, the source alone among them."""
     name = f"self_training_{task}"
-    request = make_request(TableRequest(name, load_table(name), "bench", (0,)))
+    request = make_request(name, "bench")
     planner = Planner()
     specs = {
         row.label: planner.specify(request.overrides(row.label, 0)) for row in request.trained_rows

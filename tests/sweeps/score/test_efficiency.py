@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -25,17 +26,13 @@ def test_sizes_are_those_of_paper_scale_and_errors_are_reasons() -> None:
         Row(label="wrong", experiment="crm", overrides=("model=mfnte",)),
         Row(label="theirs", values={"fps": 3.0}),
     )
-    cells = network_sizes(TableRequest("own/t", table(rows, COLUMNS), "demo", (0, 1)))
+    request = TableRequest("own/t", table(rows, COLUMNS), "demo")
+    cells = network_sizes(request)
     assert set(cells) == {("a", "size"), ("wrong", "size")}
     cell = cells["a", "size"]
     assert cell.mean * 1e6 == pytest.approx(MFNET)
     assert (cell.seeds, cell.keys, cell.reason, math.isnan(cell.sd)) == (0, (), "", True)
     assert cells["wrong", "size"].mark == "no value"
     assert "there is no model 'mfnte'; did you mean 'mfnet" in cells["wrong", "size"].reason
-
-
-def test_sizes_follow_overrides_of_every_row() -> None:
-    row = Row(label="a", experiment="crm", overrides=("model=mfnet",))
-    words = ("model.num_classes=14",)
-    cells = network_sizes(TableRequest("own/t", table((row,), COLUMNS), "demo", (0,), words))
+    cells = network_sizes(replace(request, extra=("model.num_classes=14",)))
     assert cells["a", "size"].mean * 1e6 == pytest.approx(FOURTEEN)

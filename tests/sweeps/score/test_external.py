@@ -19,7 +19,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
 from sweeps.plan.measurement import counts_of, stored_at
-from sweeps.plan.request import TableRequest, make_request
+from sweeps.plan.request import TableRequest, external_rows
 from sweeps.plan.table import Column, Row, Table
 from sweeps.point import Outcome
 from sweeps.score import external
@@ -100,7 +100,8 @@ def runs_of(data: Path, tmp_path: Path) -> Runs:
     def run(*words: str, table: Table = TABLE, trust: str = "") -> dict[str, Outcome]:
         place = ("dataset=mfnet", f"dataset.root={data}", "data.num_workers=0")
         every = (*place, *SMALL, *words)
-        request = make_request(TableRequest("my/t", table, "demo", (0,), every))
+        given, extra = external_rows(every, table)
+        request = TableRequest("my/t", table, "demo", (0,), tuple(extra), external=tuple(given))
         made = evaluate_external(request, ("tracking=none",), tmp_path / "runs", trust)
         assert {seed for _, seed in made} == {FIXED}
         return {label: outcome for (label, _), outcome in made.items()}

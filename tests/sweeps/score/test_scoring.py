@@ -128,26 +128,19 @@ def test_score_sizes_have_marks_without_seeds() -> None:
     assert marks(1.0, 1.0, 1.0) == {}
 
 
-def test_score_failed_seed_keeps_reason() -> None:
-    lost = failed("out of memory")
-    runs = {("a", 0): outcome("k", right(40)), ("a", 1): lost, ("a", 2): lost}
-    cell = scored((ACC,), runs).cells["a", "acc"]
-    assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
-    assert cell.reason == "seeds 1, 2: out of memory"
-
-
 class Uncounted(FakeResult):
     def counts(self, path: str = OWN) -> Counts:
         raise InputError(f"{self.folder}/{path} does not exist")
 
 
-def test_runs_without_counts_share_a_reason() -> None:
-    every: Any = [Uncounted(key, {}, folder=Path(key)) for key in "kl"]
-    points = [Outcome(Point(result.key, ()), "finished", results=(result,)) for result in every]
-    cell = scored((ACC,), {("a", seed): outcome for seed, outcome in enumerate(points)}).cells[
-        "a", "acc"
-    ]
-    assert cell.reason == f"seeds 0, 1: {OWN} does not exist"
+def test_seeds_without_a_value_share_a_reason() -> None:
+    runs = {("a", 0): outcome("k", right(40)), ("a", 1): failed("lost"), ("a", 2): failed("lost")}
+    for seed in (3, 4):
+        result: Any = Uncounted("key", {}, folder=Path(f"run{seed}"))
+        runs["a", seed] = Outcome(Point("", ()), "finished", results=(result,))
+    cell = scored((ACC,), runs).cells["a", "acc"]
+    assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
+    assert cell.reason == f"seeds 1, 2: lost; seeds 3, 4: {OWN} does not exist"
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", math.nan)])

@@ -14,8 +14,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import TableRequest, make_request, row_digests
-from sweeps.plan.table import load_table
+from sweeps.plan.request import make_request, row_digests
 from tests.analysis.counts import result_of
 from tests.measured import remeasured
 from tests.sweeps.judge.accuracies import accuracy
@@ -49,7 +48,7 @@ def plant(
     scale: str = "demo",
 ) -> list[Path]:
     """Runs of rows of a table with these accuracies by seed; `extra` are overrides of every row."""
-    request = make_request(TableRequest(name, load_table(name), scale, (0,), tuple(extra)))
+    request = make_request(name, scale, words=extra)
     planner, folders = Planner((f"runs_dir={runs_dir}",)), []
     request = replace(request, digests=row_digests(request, planner))
     for label, percents in shares.items():
