@@ -168,10 +168,14 @@ class ListSource:
     def _outcome(self, plan: PlannedPoint) -> Outcome:
         if plan.key in self._running:
             return plan.outcome("running")
-        if plan.key in self._ended:
-            return self._ended[plan.key]
+        ended = self._ended.get(plan.key)
+        if ended is not None and ended.state != "failed":
+            return ended
         is_retried = self._settings.retry == "failed"
         outcome = stored_outcome(plan, self._list.runs, is_retried=is_retried, is_dry=self._is_dry)
+        # What failed here counts as finished once another point or driver has trained its run.
+        if ended is not None and outcome.state != "finished":
+            return ended
         if outcome.state != "waiting":
             self._ended[plan.key] = outcome
         return outcome

@@ -24,6 +24,7 @@ from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome, Point
 from sweeps.run.optuna_study import study_folder
 from sweeps.run.point_list import (
+    ListSource,
     commands_line,
     estimated_seconds,
     other_code_line,
@@ -139,6 +140,17 @@ def test_a_failed_point_keeps_its_reason_until_it_is_retried(tmp_path: Path) -> 
     assert retried.executor.started() == [("x=0",)], "once"
     finish(tmp_path / first.keys[0])  # by hand
     assert ListDesk(tmp_path, 4).run().states()[0] == "finished"
+
+
+def test_a_failed_point_is_finished_once_another_one_trains_its_run(tmp_path: Path) -> None:
+    desk = ListDesk(tmp_path, 1)
+    source = ListSource(desk.points, desk.settings)
+    plan = source.next()
+    assert plan is not None
+    source.record(plan, plan.outcome("failed", "lost"))
+    assert [outcome.state for outcome in source.outcomes()] == ["failed"]
+    finish(tmp_path / plan.runs[0].key)
+    assert [outcome.state for outcome in source.outcomes()] == ["finished"]
 
 
 def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
