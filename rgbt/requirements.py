@@ -241,9 +241,12 @@ def record_of(component: object, kind: type[R]) -> R:
 
     InputError: its record is of another kind.
     """
-    if not hasattr(component, "record"):
+    try:
+        record: object = component.record  # type: ignore[attr-defined]
+    except AttributeError:
+        if inspect.getattr_static(component, "record", None) is not None:
+            raise  # by the property itself
         return kind()
-    record: object = component.record
     if not isinstance(record, kind):
         name = f"{type(component).__name__}.record"
         expected = f"rgbt.requirements.{kind.__name__}"

@@ -240,14 +240,15 @@ def settings_of(options: Options, of_hydra: Sequence[str] = ()) -> SweepSettings
     from sweeps.settings import read_settings
 
     words = (*of_hydra, *readable_paths([f"runs_dir={options.runs_dir}"]), "hydra.job.name=rgbt")
-    with composing(words):
-        node = compose_hydra(["hydra/sweeper=study", *words])
-    node.sweeper.hours = options.minutes and options.minutes / 60
+    given = {}
     for key, value in vars(options).items():
-        if key in node.sweeper:
-            node.sweeper[key] = str(value) if isinstance(value, Path) else value
+        given[key] = str(value) if isinstance(value, Path) else value
     try:
         with composing(words):
+            node = compose_hydra(["hydra/sweeper=study", *words])
+            node.sweeper.hours = options.minutes and options.minutes / 60
+            for key in given.keys() & node.sweeper.keys():
+                node.sweeper[key] = given[key]
             return read_settings(node)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error

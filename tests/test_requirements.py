@@ -71,3 +71,14 @@ def test_loss_without_record_requires_class_scores() -> None:
 def test_record_of_another_kind_is_refused(record: Any) -> None:
     with pytest.raises(InputError, match=r"record is .*; expected rgbt.requirements.LossRecord"):
         record_of(SimpleNamespace(record=record), LossRecord)
+
+
+def test_error_of_a_record_is_not_taken_for_a_missing_one() -> None:
+    class Wrong:
+        @property
+        def record(self) -> LossRecord:
+            return LossRecord(frames=self.no_such_attribute)  # type: ignore[attr-defined]
+
+    with pytest.raises(AttributeError, match="no_such_attribute"):
+        record_of(Wrong(), LossRecord)
+    assert record_of(object(), LossRecord) == LossRecord()

@@ -60,16 +60,17 @@ class Temporal:
         """Require a loss of two frames, whole images, and class scores of both."""
         makes_masks = record_of(self.model, NetworkRecord).outputs == "masks"
         half = Requirement("loss", "compares_half", True, "scheme.resolution=half")
+        of_view = record_of(self.view, Record)
         return SchemeRecord(
             requires=(
                 Requirement("loss", "frames", 2),
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
                 *((half,) if self.resolution == "half" else ()),
-                *(needed.inside("scheme") for needed in record_of(self.view, Record).requires),
+                *(needed.inside("scheme") for needed in of_view.requires),
             ),
             frames=2,
-            camera=self.view.camera,
+            camera=of_view.others.get("camera"),
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:

@@ -75,10 +75,10 @@ class VirtualView:
 
     @property
     def record(self) -> Record:
-        """Require that class 0, which is painted where nothing is seen, is the background."""
+        """State its camera; class 0, which is painted where nothing is seen, is the background."""
         painted = Requirement.of_background("view.outside=background")
         requires = () if self.outside == "ignore" else (painted,)
-        return Record(requires=requires)
+        return Record(requires=requires, others={"camera": self.camera})
 
     def check(self, angles: Tensor, least: float = 0.0) -> None:
         """Refuse (InputError) angles (B, 3) that leave at most a share of the camera's images."""

@@ -125,7 +125,7 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
         ("table=my/small workers=0", "workers'"),
         ("table=my/small +experiment=crm", "experiment"),
         ("table=my/small camera@consistency.view.camera=synth", "rgbt consistency"),
-        ("table=my/small hydra/launcher=joblib", "its n_jobs is workers)"),
+        ("table=my/small hydra/launcher=joblib", "its n_jobs is workers"),
         ("table=my/small hydra.launcher.partition=gpu", "partition"),
         ("table=my/small hydra.sweeper.workers=2", "hydra.sweeper.workers=2: of Hydra's words"),
         ("table=my/small +hydra.launcher.key=1", "+hydra.launcher.key=1: of Hydra's words"),
