@@ -100,7 +100,7 @@ def tags_from_environment() -> dict[str, str]:
 
 
 def _short(word: str) -> str:
-    """Remove quotes of a word, and cut a long value in its middle, where a digest tells it."""
+    """Remove quotes of a word, and cut a long value in its middle, which a digest identifies."""
     key, equals, value = word.partition("=")
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         value = value[1:-1]

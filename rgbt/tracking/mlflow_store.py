@@ -1,4 +1,4 @@
-"""Show runs in MLflow, filled from the run folder as training goes on.
+"""Show runs in MLflow, filled from the run folder during training.
 
 The run folder is the source of truth; ``rgbt sync`` fills what could not be sent. The address of a
 store comes from the configuration, never from a run folder.

@@ -337,7 +337,7 @@ class JudgedTable:
             best, wanted = min(means, key=lambda label: means[label]), LOWER
         same = [best]
         others = means.keys() - {best}
-        # The nearest row first: if it cannot be told apart, the others need no interval.
+        # The nearest row first: if it cannot be distinguished, the others need no interval.
         for label in sorted(others, key=lambda other: abs(means[other] - means[best])):
             try:
                 terms = self.terms(difference(best, label, column.name).cells)
