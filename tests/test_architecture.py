@@ -19,7 +19,7 @@ FILES = [
 ]
 
 ALONE = {
-    *("types", "checks", "ranges", "randomness", "processes", "cores", "class_scores", "averaging")
+    *("types", "checks", "ranges", "randomness", "processes", "cores", "class_scores", "averaging", "fusion")
 }
 BASE = ALONE | {"dataset", "requirements", "files", "terminal", "tables"}
 SHARED = BASE | {"geometry"}

@@ -9,9 +9,11 @@ import ctypes
 import os
 import platform
 import re
+import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -85,14 +87,22 @@ def prepare_training(network: nn.Module, settings: TrainerSettings) -> None:
 
     The keys of its state do not change, and evaluation uses the network as it is.
     """
-    if settings.activation_checkpointing and settings.compile != "none":
+    if settings.activation_checkpointing and settings.compile in MODES:
         raise InputError("trainer.activation_checkpointing: cannot be used with trainer.compile.")
     if settings.activation_checkpointing:
         recompute_activations(network)
-    if settings.compile != "none":
+    if settings.compile in MODES:
         # The graph recomputes what these functions keep per size, which costs little.
         warnings.filterwarnings("ignore", message=r"(?s).*lru_cache", category=UserWarning)
         object.__setattr__(network, "forward", TrainingForward(network, MODES[settings.compile]))
+
+
+def compiles_functions(settings: TrainerSettings, device: torch.device) -> bool:
+    """Whether a training on `device` compiles the functions that `rgbt.fusion` marks."""
+    if settings.compile != "auto":
+        return settings.compile == "functions"
+    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+    return device.type == "cuda" and compiler is not None and find_spec("triton") is not None
 
 
 def recompute_activations(network: nn.Module) -> None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 
 from rgbt.checks import InputError, RunError
+from rgbt.engine.device import MODES
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import num_processes
 from rgbt.requirements import NetworkRecord
@@ -39,7 +40,8 @@ def training_advice(
 ) -> str:
     """Name settings with which a training needs less: to resume it, and for a new run."""
     same, other = [], []
-    if network.recomputed and trainer.compile == "none" and not trainer.activation_checkpointing:
+    is_whole = trainer.compile in MODES
+    if network.recomputed and not is_whole and not trainer.activation_checkpointing:
         same.append("trainer.activation_checkpointing=true")
     share = batch_size // num_processes()
     parts = next((number for number in range(2, share + 1) if share % number == 0), None)

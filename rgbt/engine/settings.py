@@ -61,7 +61,7 @@ class TrainerSettings:
     batch_norm_parts: ranges.NumDevices = 1
     activation_checkpointing: bool = False
     memory_format: Literal["contiguous", "channels_last"] = "contiguous"
-    compile: Literal["none", "default", "max-autotune"] = "none"
+    compile: Literal["auto", "none", "functions", "default", "max-autotune"] = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,10 +30,12 @@ from rgbt.engine.checkpoint import (
     restore_weights,
     training_payload,
 )
+from rgbt.engine.device import compiles_functions
 from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress, watch_pace
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
+from rgbt.fusion import compile_fused
 from rgbt.processes import (
     average_gradients,
     collected,
@@ -143,7 +145,8 @@ class Trainer:
             Stopped: a signal came; it waits for the step, and its `step` is saved.
         """
         total = self.settings.max_steps
-        with progress() as display, deferred():
+        functions = compile_fused(compiles_functions(self.settings, self.fabric.device))
+        with progress() as display, deferred(), functions:
             task = display.add_task("training", total=total, completed=state.step, note="")
             if self._is_due(state):  # a signal came before its evaluation
                 self._evaluate_and_save(state)
@@ -300,7 +303,7 @@ class Trainer:
 
         So are the last where the score is undefined (NaN), as of labels of one class.
         """
-        with at_once():
+        with at_once(), compile_fused(False):  # the sizes of its images may differ
             score = self.hooks.evaluate(state.step, self.weights.network)
         if score is None:
             keeps = state.step == self.settings.max_steps

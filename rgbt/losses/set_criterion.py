@@ -10,7 +10,6 @@ targets of the batch: one per class present in an image, by image, then by class
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
+from rgbt.fusion import fused
 from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import EVERY, Points, class_shares, most_uncertain, sample
 from rgbt.losses.spatial import PLAIN, PointWeights, SpatialMap, SpatialWeight
@@ -29,8 +29,9 @@ from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import LossRecord, Requirement
 from rgbt.types import IGNORE, Batch, Output
 
-# Size of the largest temporary of a step. A larger one does not fit in the processor's cache.
-CHUNK_BYTES = 16 * 2**20
+# Size of the largest temporary of a step on a CPU, whose cache a larger one does not fit, and on a
+# GPU, where fewer and larger kernels are faster.
+CHUNK_BYTES, CHUNK_BYTES_GPU = 16 * 2**20, 512 * 2**20
 
 
 @dataclass(kw_only=True, eq=False)
@@ -145,24 +146,26 @@ class SetCriterion:
         images. Errors as of `assign`.
         """
         layers, passes, images, queries = class_logits.shape[:4]
-        step = max(1, CHUNK_BYTES // (4 * images * queries * self.num_points))
+        probabilities = class_logits.float().softmax(-1)[..., :-1].flatten(0, 1)
+        sets = _chunk_bytes(mask_logits) // (4 * images * queries * self.num_points)
+        step = max(1, min(sets, passes))  # passes of one layer, or whole layers
         costs = []
-        for layer, start in product(range(layers), range(0, passes, step)):
-            block = slice(start, start + step)
-            probability = class_logits[layer, block].float().softmax(-1)[..., :-1]
-            masks = mask_logits[layer, block]
-            drawn = points.matcher(len(masks), images, self.num_points)
-            x = sample(masks.flatten(0, 1).float(), drawn.flatten(0, 1)[:, None])[:, :, 0]
-            t = class_shares(targets.label, drawn, targets.present.shape[1]).flatten(0, 1)
-            weights = None
-            if targets.spatial is not None and self.spatial.match == "weighted":
-                every = torch.arange(images, device=drawn.device)
-                weights = targets.spatial.at(drawn, every, layer * passes + start)
-                weights = PointWeights(*(part.flatten(0, 1) for part in weights))
-                t = t * weights.values[:, None]
-            cost = pairwise_costs(x, t, weights, self.mask_weight, self.dice_weight)
-            costs.append(cost.reshape(probability.shape) - self.class_weight * probability)
-        return assign(torch.cat(costs), targets)
+        for layer in range(0, layers, max(1, sets // passes)):
+            of_layers = mask_logits[layer : layer + max(1, sets // passes)]
+            for start in range(0, passes, step):
+                masks = of_layers[:, start : start + step]
+                drawn = points.matcher(len(masks) * masks.shape[1], images, self.num_points)
+                x = sample(masks.flatten(0, 2).float(), drawn.flatten(0, 1)[:, None])[:, :, 0]
+                t = class_shares(targets.label, drawn, targets.present.shape[1]).flatten(0, 1)
+                weights = None
+                if targets.spatial is not None and self.spatial.match == "weighted":
+                    every = torch.arange(images, device=drawn.device)
+                    weights = targets.spatial.at(drawn, every, layer * passes + start)
+                    weights = PointWeights(*(part.flatten(0, 1) for part in weights))
+                    t = t * weights.values[:, None]
+                costs.append(pairwise_costs(x, t, weights, self.mask_weight, self.dice_weight))
+        cost = torch.cat(costs).reshape(probabilities.shape)
+        return assign(cost - self.class_weight * probabilities, targets)
 
     def _class_loss(self, logits_LPBQC: Tensor, matches: Matches) -> Tensor:
         """(S,): cross-entropy of all queries, divided by the sum of their weights."""
@@ -186,7 +189,8 @@ class SetCriterion:
         label = torch.from_numpy(matches.label).to(device)
         query = torch.from_numpy(matches.query).to(device)
         masks = (targets.label[image] == label[:, None, None])[:, None].float()
-        step = max(1, CHUNK_BYTES // max(1, 8 * len(image) * self.num_drawn))
+        of_set = 8 * len(image) * self.num_drawn
+        step = max(1, _chunk_bytes(logits_LPBQhw) // max(1, of_set))
 
         # (S, G, h, w) float32 mask logits of the matched queries.
         layers, passes = logits_LPBQhw.shape[:2]
@@ -250,22 +254,28 @@ def pairwise_costs(
 ) -> Tensor:
     """(R, Q, K): mask and dice cost of every query against every target, see `SetCriterion.match`.
 
-    x (R, Q, N) are mask logits, overwritten, and t (R, K, N) targets, already weighted.
+    x (R, Q, N) are mask logits, and t (R, K, N) targets, already weighted.
     """
     total: Tensor | float = x.shape[-1]
     smoothing: Tensor | float = 1.0
+    w = None
     if weights is not None:
         total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
+        w = weights.values[:, None]
+    s, softened = sigmoid_and_softplus(x, w)
+    # One product gives the sums with the targets, and over all points.
+    last = torch.ones_like(t[:, :1]) if w is None else w
+    both = s @ torch.cat([t, last], dim=1).mT
+    common, of_s = both[..., :-1], both[..., -1:]
+    dice = (2 * common + smoothing) / (of_s + t.sum(-1)[:, None] + smoothing)
+    return mask_weight * ((softened - x @ t.mT) / total) + dice_weight * (1 - dice)
 
-    def over_points(values: Tensor) -> Tensor:
-        if weights is None:
-            return values.sum(-1, keepdim=True)
-        return values @ weights.values[..., None]
 
-    bce = (over_points(F.softplus(x)) - x @ t.mT) / total
-    s = x.sigmoid_()
-    dice = (2 * (s @ t.mT) + smoothing) / (over_points(s) + t.sum(-1)[:, None] + smoothing)
-    return mask_weight * bce + dice_weight * (1 - dice)
+@fused
+def sigmoid_and_softplus(x: Tensor, w: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the sigmoid of x (R, Q, N), and sums of softplus with weights (R, 1, N): (R, Q, 1)."""
+    softened = F.softplus(x)
+    return x.sigmoid(), (softened if w is None else softened * w).sum(-1, keepdim=True)
 
 
 def assign(cost: Tensor, targets: Targets) -> Matches:
@@ -315,14 +325,26 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
 
     (..., N) float32 logits x, (..., N) targets t in [0, 1] -> two of (...).
     """
-    bce = F.softplus(x) - x * t
-    s = x.sigmoid()
     if weights is None:
-        return bce.mean(-1), 1 - (2 * (s * t).sum(-1) + 1) / (s.sum(-1) + t.sum(-1) + 1)
+        bce, common, both = mask_sums(x, t)
+        return bce / x.shape[-1], 1 - (2 * common + 1) / (both + 1)
     w, total, e = weights
-    t = w * t
-    both = (w * s).sum(-1) + t.sum(-1)
-    return (w * bce).sum(-1) / total, 1 - (2 * (s * t).sum(-1) + e) / (both + e)
+    bce, common, both = mask_sums(x, t, w)
+    return bce / total, 1 - (2 * common + e) / (both + e)
+
+
+@fused
+def mask_sums(x: Tensor, t: Tensor, w: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the sums over points of BCE, s t and s + t of `mask_and_dice`, with weights w."""
+    bce, s = F.softplus(x) - x * t, x.sigmoid()
+    if w is not None:
+        bce, s, t = w * bce, s, w * t
+        return bce.sum(-1), (s * t).sum(-1), (w * s).sum(-1) + t.sum(-1)
+    return bce.sum(-1), (s * t).sum(-1), s.sum(-1) + t.sum(-1)
+
+
+def _chunk_bytes(x: Tensor) -> int:
+    return CHUNK_BYTES if x.device.type == "cpu" else CHUNK_BYTES_GPU
 
 
 def _read(logits_SGhw: Tensor, points_SGN2: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
+from rgbt.fusion import fused
 from rgbt.processes import num_processes, own
 from rgbt.ranges import ShareBelowOne
 
@@ -72,6 +73,21 @@ def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
     return x + residual if factor is None else torch.addcmul(x, residual, factor)
 
 
+@fused
+def add_and_normalise(
+    x: Tensor, residual: Tensor, factor: Tensor | None, norm: tuple[Tensor, Tensor, float]
+) -> tuple[Tensor, Tensor]:
+    """Return `add_residual`, and its layer normalisation by weight, bias and epsilon."""
+    weight, bias, eps = norm
+    x = add_residual(x, residual, factor)
+    return x, F.layer_norm(x, x.shape[-1:], weight, bias, eps)
+
+
+def parameters_of(norm: nn.LayerNorm) -> tuple[Tensor, Tensor, float]:
+    """Return weight, bias and epsilon of a layer normalisation."""
+    return norm.weight, norm.bias, norm.eps
+
+
 def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
     """Set whole channels of (N, C, H, W) to 0 with probability `rate`, and rescale the others.
 
@@ -105,8 +121,9 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
         """(N, H, W, C) -> the same."""
         first, second = keep
-        x = add_residual(x, self.attn(self.norm1(x)), first)
-        return add_residual(x, self.mlp(self.norm2(x)), second)
+        residual = self.attn(self.norm1(x))
+        x, normed = add_and_normalise(x, residual, first, parameters_of(self.norm2))
+        return add_residual(x, self.mlp(normed), second)
 
 
 def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:

@@ -111,19 +111,32 @@ class WindowAttention(nn.Module):
         shape = 3, n, rows * columns, self.heads, side * side, -1
         q, k, v = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(shape).unbind(0)
 
-        # (heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2.
+        # (1, heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2.
         bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)
-        bias = bias.permute(2, 0, 1)
+        bias = bias.permute(2, 0, 1)[None]
         if shift:
             bias = bias + shift_mask((height, width), side, shift, bias.device)
-        scores = (q * self.scale) @ k.transpose(-2, -1)
-        out = (scores + bias).softmax(-1) @ v
+        out = attend(q, k, v, bias, self.scale)
 
         out = out.view(n, rows, columns, self.heads, side, side, -1)
         out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
         if shift:
             out = out.roll((shift, shift), (1, 2))
-        return self.proj(out[:, : hw[0], : hw[1]])
+        if below or right:
+            out = F.pad(out, (0, 0, 0, -right, 0, -below))
+        return self.proj(out)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, scale: float) -> Tensor:
+    """Attend in windows: (N, windows, heads, t, d) each, bias (1 or windows, heads, t, t)."""
+    if q.device.type != "cuda":
+        return (((q * scale) @ k.transpose(-2, -1)) + bias).softmax(-1) @ v
+    # One kernel, which writes no scores and takes four dimensions.
+    n, windows = q.shape[:2]
+    bias = bias.expand(n, windows, -1, -1, -1).flatten(0, 1).to(q.dtype)
+    q, k, v = (part.flatten(0, 1) for part in (q, k, v))
+    out = F.scaled_dot_product_attention(q, k, v, bias, scale=scale)
+    return out.view(n, windows, *out.shape[1:])
 
 
 class PatchMerging(nn.Module):

@@ -9,17 +9,25 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
+
+from rgbt.fusion import fused
+from rgbt.models.parts import add_and_normalise, parameters_of
 
 GROUPS = 32  # groups of every normalisation (Mask2Former release)
 NUM_LEVELS = 3
 POINTS = 4  # sampled per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)
+
+# What is read of a block of maps in `SampleSum` stays in the cache of a core.
+BLOCK_BYTES = 2 * 2**20
 
 # Rows and columns of every level.
 Levels = tuple[tuple[int, int], ...]
@@ -138,20 +146,98 @@ class DeformableAttention(nn.Module):
         offset = _project(self.sampling_offsets, query)
         offset = offset.view(batch * self.heads, self.num_levels, POINTS, 2, length)
         centre, scale = centre_grid(levels, query.device)
-        grids = torch.addcmul(centre, offset, scale).unbind(1)
+        grid = torch.addcmul(centre, offset, scale)
+        read = SampleSum.apply if torch.is_grad_enabled() else sample_sum
+        total = read(value.float(), grid.float(), weights.float(), levels)
+        return _project(self.output_proj, total.view(batch, dim, length)).transpose(1, 2)
 
-        parts = []
-        values = torch.split(value, [rows * columns for rows, columns in levels], -1)
-        shares = torch.split(weights, POINTS, 1)
-        for value_l, weight_l, grid, hw in zip(values, shares, grids, levels, strict=True):
-            maps = value_l.view(*value_l.shape[:2], *hw)
-            sampled = F.grid_sample(maps, grid.transpose(2, 3), align_corners=False)
-            parts.append((sampled * weight_l[:, None]).sum(2))
-        total = parts[0]
-        for part in parts[1:]:
-            total = total + part
-        total = total.view(batch, dim, length)
-        return _project(self.output_proj, total).transpose(1, 2)
+
+def sample_sum(value: Tensor, grid: Tensor, weights: Tensor, levels: Levels) -> Tensor:
+    """Read maps at points, and return the weighted sum of what was read for every token.
+
+    (R, C, S) values of all levels, (R, levels, points, 2, S) positions, (R, levels * points, S)
+    weights -> (R, C, S); float32.
+    """
+    total: Tensor | None = None
+    shares = torch.split(weights, POINTS, 1)
+    every = zip(_maps_of(value, levels), shares, grid.unbind(1), strict=True)
+    for maps, weight, points in every:
+        sampled = F.grid_sample(maps, points.transpose(2, 3), align_corners=False)
+        part = weighted_sum(sampled, weight)
+        total = part if total is None else total + part
+    assert total is not None, "there are levels"
+    return total
+
+
+def _maps_of(value: Tensor, levels: Levels) -> list[Tensor]:
+    """View the tokens (R, C, S) as the maps of the levels, (R, C, rows, columns)."""
+    parts = torch.split(value, [rows * columns for rows, columns in levels], -1)
+    return [part.view(*part.shape[:2], *hw) for part, hw in zip(parts, levels, strict=True)]
+
+
+@fused
+def weighted_sum(sampled: Tensor, weight: Tensor) -> Tensor:
+    """(R, C, points, S) and (R, points, S) -> (R, C, S)."""
+    return (sampled * weight[:, None]).sum(2)
+
+
+@fused
+def weighted_sum_gradients(
+    sampled: Tensor, weight: Tensor, gradient: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients of what was read and of the weights, for that of `weighted_sum`."""
+    spread = gradient[:, :, None]
+    return spread * weight[:, None], (sampled * spread).sum(1)
+
+
+class SampleSum(torch.autograd.Function):
+    """Computes `sample_sum` and its gradients by blocks of maps that fit the processor's cache.
+
+    It keeps its arguments alone. What is read at the points is four times as large as a map, and is
+    read again in the backward pass: that takes no longer than fetching it from memory.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, grid: Tensor, weights: Tensor, levels: Levels) -> Tensor:
+        """See `sample_sum`."""
+        ctx.save_for_backward(value, grid, weights)
+        ctx.levels = levels
+        total = torch.empty_like(value)
+        for rows in _blocks(value):
+            total[rows] = sample_sum(value[rows], grid[rows], weights[rows], levels)
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        """Return the gradients of values, positions and weights."""
+        value, grid, weights = ctx.saved_tensors
+        found = torch.empty_like(value), torch.empty_like(grid), torch.empty_like(weights)
+        for rows in _blocks(value):
+            of_value, of_grid, of_weights = (x[rows] for x in found)
+            places = _maps_of(of_value, ctx.levels)
+            every = zip(_maps_of(value[rows], ctx.levels), places, strict=True)
+            for level, (maps, place) in enumerate(every):
+                part = slice(level * POINTS, (level + 1) * POINTS)
+                points = grid[rows, level].transpose(2, 3)
+                sampled = F.grid_sample(maps, points, align_corners=False)
+                weight, by_level = weights[rows, part], gradient[rows]
+                of_sampled, of_weights[:, part] = weighted_sum_gradients(sampled, weight, by_level)
+                of_maps, of_points = torch.ops.aten.grid_sampler_2d_backward(
+                    of_sampled, maps, points, 0, 0, False, (True, True)
+                )
+                place.copy_(of_maps)
+                of_grid[:, level] = of_points.transpose(2, 3)
+        return *found, None
+
+
+def _blocks(value: Tensor) -> Iterator[slice]:
+    """Cut (R, C, S) into rows whose samples are about `BLOCK_BYTES`; a GPU has one block."""
+    step = len(value)
+    if value.device.type == "cpu":
+        step = max(1, BLOCK_BYTES // (4 * POINTS * value[0].numel()))
+    for start in range(0, len(value), step):
+        yield slice(start, start + step)
 
 
 def _project(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -159,6 +245,12 @@ def _project(layer: nn.Linear, x: Tensor) -> Tensor:
     batch, _, length = x.shape
     bias = layer.bias[:, None].expand(batch, -1, length)
     return torch.baddbmm(bias, layer.weight.expand(batch, -1, -1), x)
+
+
+def add_then_normalise(x: Tensor, residual: Tensor, norm: nn.Module) -> Tensor:
+    """Return the normalised sum: (..., C) twice -> (..., C)."""
+    assert isinstance(norm, nn.LayerNorm), "it has weight, bias and epsilon"
+    return add_and_normalise(x, residual, None, parameters_of(norm))[1]
 
 
 class EncoderLayer(nn.Module):
@@ -177,8 +269,10 @@ class EncoderLayer(nn.Module):
 
     def forward(self, tokens: Tensor, position: Tensor, levels: Levels) -> Tensor:
         """(B, S, C) -> (B, S, C); `position` (S, C) is added to the queries only."""
-        tokens = self.norm1(tokens + self.self_attn(tokens + position, tokens, levels))
-        return self.norm2(tokens + self.linear2(F.relu(self.linear1(tokens))))
+        read = self.self_attn(tokens + position, tokens, levels)
+        tokens = add_then_normalise(tokens, read, self.norm1)
+        hidden = F.relu(self.linear1(tokens))
+        return add_then_normalise(tokens, self.linear2(hidden), self.norm2)
 
 
 class LevelEncoder(nn.Module):
@@ -334,7 +428,7 @@ class AttentionLayer(nn.Module):
     ) -> Tensor:
         """(B, Q, C), without and with position, and keys and values (B, S, C) -> (B, Q, C)."""
         attention, norm = self.children()
-        return norm(queries + attention(placed, *memory, allowed))
+        return add_then_normalise(queries, attention(placed, *memory, allowed), norm)
 
 
 class FfnLayer(nn.Module):
@@ -350,7 +444,8 @@ class FfnLayer(nn.Module):
 
     def forward(self, queries: Tensor) -> Tensor:
         """(B, Q, C) -> (B, Q, C)."""
-        return self.norm(queries + self.linear2(F.relu(self.linear1(queries))))
+        hidden = F.relu(self.linear1(queries))
+        return add_then_normalise(queries, self.linear2(hidden), self.norm)
 
 
 def mask_embed(dim: int) -> nn.Sequential:
