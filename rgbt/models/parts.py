@@ -77,7 +77,7 @@ def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
 def add_and_normalise(
     x: Tensor, residual: Tensor, factor: Tensor | None, norm: tuple[Tensor, Tensor, float]
 ) -> tuple[Tensor, Tensor]:
-    """Return `add_residual`, and its layer normalisation by weight, bias and epsilon."""
+    """Return `add_residual`, (N, T, C), and its layer normalisation by weight, bias, epsilon."""
     weight, bias, eps = norm
     x = add_residual(x, residual, factor)
     return x, F.layer_norm(x, x.shape[-1:], weight, bias, eps)
@@ -120,10 +120,13 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
         """(N, H, W, C) -> the same."""
-        first, second = keep
-        residual = self.attn(self.norm1(x))
-        x, normed = add_and_normalise(x, residual, first, parameters_of(self.norm2))
-        return add_residual(x, self.mlp(normed), second)
+        first, second = (None if part is None else part.flatten(1, 2) for part in keep)
+        # Tokens in one dimension: a map of any size has the same compiled function.
+        read = self.attn(self.norm1(x)).flatten(1, 2)
+        norm = parameters_of(self.norm2)
+        tokens, normed = add_and_normalise(x.flatten(1, 2), read, first, norm)
+        changed = self.mlp(normed.view(x.shape)).flatten(1, 2)
+        return add_residual(tokens, changed, second).view(x.shape)
 
 
 def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:

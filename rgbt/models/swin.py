@@ -129,9 +129,13 @@ class WindowAttention(nn.Module):
 
 def attend(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, scale: float) -> Tensor:
     """Attend in windows: (N, windows, heads, t, d) each, bias (1 or windows, heads, t, t)."""
-    if q.device.type != "cuda":
-        return (((q * scale) @ k.transpose(-2, -1)) + bias).softmax(-1) @ v
-    # One kernel, which writes no scores and takes four dimensions.
+    if q.device.type == "cuda":
+        return attend_in_one_kernel(q, k, v, bias, scale)
+    return ((q * scale) @ k.transpose(-2, -1) + bias).softmax(-1) @ v
+
+
+def attend_in_one_kernel(q: Tensor, k: Tensor, v: Tensor, bias: Tensor, scale: float) -> Tensor:
+    """Compute `attend` without writing the scores, which does not pay on a CPU."""
     n, windows = q.shape[:2]
     bias = bias.expand(n, windows, -1, -1, -1).flatten(0, 1).to(q.dtype)
     q, k, v = (part.flatten(0, 1) for part in (q, k, v))

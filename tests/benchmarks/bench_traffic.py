@@ -3,19 +3,26 @@
 Bytes are those of the inputs and outputs of every operation that is no view. An eager step needs at
 least bytes / bandwidth and FLOPs / rate, and about four microseconds for every kernel.
 
-Run: python -m tests.benchmarks.bench_traffic [swin_s] [batch=2] [top=25]
+The criterion and the deformable attention work in the chunks that they have on a GPU. With
+``fused=yes``, functions marked by `rgbt.fusion` without a gradient of their own are counted as one
+kernel that reads its arguments and writes its results, as `trainer.compile=functions` makes them.
+
+Run: python -m tests.benchmarks.bench_traffic [swin_s] [batch=2] [top=25] [fused=yes]
 """
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
+import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
@@ -23,6 +30,8 @@ from rgbt.assembly.training_setup import set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Hooks, Trainer
+from rgbt.losses import set_criterion
+from rgbt.models.mask2former import head
 from rgbt.runs.specify import specify
 from tests.benchmarks.gpu import write_images
 
@@ -48,6 +57,7 @@ class Traffic(TorchDispatchMode):
         self.bytes: Counter[tuple[str, str, str]] = Counter()
         self.calls: Counter[tuple[str, str, str]] = Counter()
         self.flops = 0
+        self.is_counting = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = func(*args, **(kwargs or {}))
@@ -68,6 +78,34 @@ class Traffic(TorchDispatchMode):
                 *args, **(kwargs or {}), out_val=found
             )
         return found
+
+    def add_fused(self, function: Callable[..., Any], *, dynamic: bool) -> Callable[..., Any]:
+        """Stand for `torch.compile`: call a function that is counted as one kernel."""
+        assert dynamic, "as rgbt.fusion compiles"
+
+        def call(*arguments: Any) -> Any:
+            leaves = tree_leaves(arguments)
+            if not self.is_counting:
+                return function(*arguments)
+            if torch.is_grad_enabled() and any(_has_gradient(leaf) for leaf in leaves):
+                return function(*arguments)
+            with _disable_current_modes():
+                found = function(*arguments)
+            moved = 0
+            for leaf in (*leaves, *tree_leaves(found)):
+                if isinstance(leaf, Tensor):
+                    moved += leaf.numel() * leaf.element_size()
+            key = place_of(sys._getframe(1)), f"fused {function.__name__}", ""
+            self.kernels["fused"] += 1
+            self.bytes[key] += moved
+            self.calls[key] += 1
+            return found
+
+        return call
+
+
+def _has_gradient(leaf: object) -> bool:
+    return isinstance(leaf, Tensor) and leaf.requires_grad
 
 
 def place_of(frame: Any) -> str:
@@ -94,21 +132,27 @@ class _Batches:
         self.number += 1
         if self.number == 2:
             self.traffic.__enter__()
+            self.traffic.is_counting = True
         if self.number == 3:
             self.traffic.__exit__(None, None, None)
             raise KeyboardInterrupt
         return self.batch
 
 
-def count(network: str, batch_size: int, settings: tuple[str, ...] = ()) -> Traffic:
+def count(network: str, batch_size: int, *, is_fused: bool = False) -> Traffic:
     """Count a step of CRM as published, with random images and weights."""
     traffic = Traffic()
-    with TemporaryDirectory() as folder:
+    with (
+        TemporaryDirectory() as folder,
+        mock.patch.object(set_criterion, "CHUNK_BYTES", set_criterion.CHUNK_BYTES_GPU),
+        mock.patch.object(head, "BLOCK_BYTES", 2**40),
+        mock.patch.object(torch, "compile", traffic.add_fused),
+    ):
         images = write_images(Path(folder, "images"), 2 * batch_size, (480, 640))
         words = ["+experiment=crm", "scale=paper", f"model=mask2former_{network}"]
         words += ["tracking=none", "trainer.accelerator=cpu", f"dataset.root={images}"]
         words += ["data.num_workers=0", f"recipe.batch_size={batch_size}", "scale.pretrained=false"]
-        words += settings
+        words += [f"trainer.compile={'functions' if is_fused else 'none'}"]
         setup = set_up_training(specify(compose(words), words), upstream_finished=False)
         trainer = Trainer(
             fabric=setup.fabric,
@@ -130,9 +174,9 @@ def count(network: str, batch_size: int, settings: tuple[str, ...] = ()) -> Traf
     raise AssertionError("unreachable: the batches end with KeyboardInterrupt")
 
 
-def main(network: str = "swin_s", batch: str = "2", top: str = "25") -> None:
+def main(network: str = "swin_s", batch: str = "2", top: str = "25", fused: str = "no") -> None:
     """Print the totals, and what moves most."""
-    traffic = count(network, int(batch))
+    traffic = count(network, int(batch), is_fused=fused == "yes")
     kernels, moved = sum(traffic.kernels.values()), sum(traffic.bytes.values())
     print(
         f"{network}, batch {batch}, 256x320: {kernels} kernels, {sum(traffic.views.values())} "

@@ -335,8 +335,9 @@ def test_weighted_losses_by_hand() -> None:
     assert torch.allclose(dice, torch.tensor([11 / 15]))
 
 
-def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
-    output, batch = problem_of(3, 4, 2)
+@pytest.mark.parametrize("size", [1, 5_000, 2**40])
+def test_losses_do_not_depend_on_the_chunks(size: int, monkeypatch: Any) -> None:
+    output, batch = problem_of(3, 4, 2)  # one pass, several passes, or all layers at once
     criterion = criterion_of()
 
     def losses() -> torch.Tensor:
@@ -344,7 +345,7 @@ def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
         return torch.stack(list(criterion.compare(output, batch, points).values()))
 
     whole = losses()
-    monkeypatch.setattr(set_criterion, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(set_criterion, "CHUNK_BYTES", size)
     assert torch.allclose(whole, losses(), rtol=1e-6)
 
 

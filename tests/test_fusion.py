@@ -1,0 +1,107 @@
+"""Functions that a training may compile: when they are, and that its losses stay the same."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from rgbt.engine.device import compiles_functions
+from rgbt.fusion import compile_fused, fused
+from tests.engine.test_device import settings
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
+
+
+def test_marked_functions_are_compiled_inside_the_block_alone(monkeypatch: Any) -> None:
+    compiled: list[str] = []
+
+    def stand_in(function: Any, *, dynamic: bool) -> Any:
+        assert dynamic
+        compiled.append(function.__name__)
+        return lambda x: function(x) + 100
+
+    monkeypatch.setattr(torch, "compile", stand_in)
+
+    @fused
+    def double(x: int) -> int:
+        return 2 * x
+
+    assert double(1) == 2
+    with compile_fused(True):
+        assert [double(1), double(2)] == [102, 104]
+        with compile_fused(False):  # an evaluation
+            assert double(1) == 2
+        assert double(3) == 106
+    with pytest.raises(ValueError, match="stops"), compile_fused(True):
+        raise ValueError("stops")
+    assert (double(1), compiled) == (2, ["double"])
+
+
+@pytest.mark.parametrize(
+    ("setting", "device", "there", "expected"),
+    [
+        ("auto", CPU, True, False),
+        ("auto", CUDA, True, True),
+        ("auto", CUDA, False, False),  # no Triton, or no C compiler
+        ("functions", CPU, False, True),
+        ("none", CUDA, True, False),
+        ("default", CUDA, True, False),
+    ],
+)
+def test_functions_are_compiled_on_gpus_that_can(
+    setting: Any, device: torch.device, there: bool, expected: bool, monkeypatch: Any
+) -> None:
+    found = "/usr/bin/gcc" if there else None
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr("rgbt.engine.device.shutil.which", lambda name: found)
+    monkeypatch.setattr("rgbt.engine.device.find_spec", lambda name: object() if there else None)
+    assert compiles_functions(settings(compile=setting), device) is expected
+
+
+STEPS = """
+import json, sys, tempfile, torch
+from pathlib import Path
+from rgbt.assembly.training_setup import set_up_training
+from rgbt.config.compose import compose
+from rgbt.engine.checkpoint import State
+from rgbt.engine.trainer import Hooks, Trainer
+from rgbt.runs.specify import specify
+import torch._dynamo.utils as seen
+words = ["+experiment=crm", "+debug=smoke", "tracking=none", "trainer.accelerator=cpu"]
+words += ["trainer.max_steps=6", "trainer.log_every=1", f"trainer.compile={sys.argv[1]}"]
+setup = set_up_training(specify(compose(words), words), upstream_finished=False)
+losses, graphs = [], []
+hooks = Hooks()
+def log(step, values):
+    losses.append(values["loss"]); graphs.append(seen.counters["stats"]["unique_graphs"])
+hooks.log = log
+trainer = Trainer(
+    fabric=setup.fabric, settings=setup.session.trainer, phases=setup.scheme.phases,
+    model=setup.model, others=setup.others, optimizers=setup.optimizers, schedule=setup.schedule,
+    steps_per_epoch=100, folder=Path(tempfile.mkdtemp()), hooks=hooks,
+)
+trainer.fit(setup.batches(range(6)), State(seed=0))
+print(json.dumps([losses, graphs]))
+"""
+
+
+@pytest.mark.slow
+def test_compiled_functions_give_the_same_losses_and_are_compiled_in_three_steps() -> None:
+    found = []
+    for setting in ("none", "functions"):
+        call = [sys.executable, "-c", STEPS, setting]
+        root = Path(__file__).parents[1]
+        done = subprocess.run(call, capture_output=True, text=True, check=True, cwd=root)
+        found.append(json.loads(done.stdout.splitlines()[-1]))
+    (plain, none), (compiled, graphs) = found
+    assert compiled[0] == pytest.approx(plain[0], rel=1e-6)
+    assert compiled == pytest.approx(plain, rel=1e-4)
+    assert none[-1] == 0
+    assert 0 < graphs[0] < 20
+    assert graphs[2:] == [graphs[2]] * 4
