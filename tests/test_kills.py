@@ -38,11 +38,11 @@ SETTINGS = (
     *("+experiment=mfnet", "dataset=mfnet", "scale.batch_size=2", "scale.eval_batch_size=2"),
     *("scale.crop_hw=[64,64]", "scale.train_sizes=[64]", "scale.test_short_edge=64"),
     *(f"trainer.max_steps={STEPS}", f"trainer.eval_every={EVAL_EVERY}"),
-    *("trainer.checkpoint_every=2", "trainer.log_every=1", "trainer.accelerator=cpu"),
+    *("trainer.checkpoint_minutes=0", "trainer.log_every=1", "trainer.accelerator=cpu"),
     *("trainer.threads=1", "masker.patch_size=null"),
 )
 ENDINGS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib")
+TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib", "seconds_left")
 
 FORKS = multiprocessing.get_context("forkserver")
 
