@@ -98,10 +98,10 @@ def _in_words(values: Mapping[str, float]) -> str:
     parts = []
     for name, value in values.items():
         if name.startswith("loss/"):
-            parts.append(f"{name.removeprefix('loss/')} {value:<5.3g}")
+            parts.append(f"{name.removeprefix('loss/')} {value:<4.2g}")
     return (
-        f"left {left!s:>8}  {values['images_per_s']:6.1f} img/s  {gib:5.1f} GiB  lr {rate:.1e}  "
-        f"loss {values['loss']:<7.4g} {' '.join(parts)}".rstrip()
+        f"left {left!s:>7}  {values['images_per_s']:5.1f} img/s  {gib:4.1f} GiB  lr {rate:.1e}  "
+        f"loss {values['loss']:<6.4g} {' '.join(parts)}".rstrip()
     )
 
 
