@@ -100,8 +100,8 @@ def _in_words(values: Mapping[str, float]) -> str:
         if name.startswith("loss/"):
             parts.append(f"{name.removeprefix('loss/')} {value:<4.2g}")
     return (
-        f"left {left!s:>7}  {values['images_per_s']:5.1f} img/s  {gib:4.1f} GiB  lr {rate:.1e}  "
-        f"loss {values['loss']:<6.4g} {' '.join(parts)}".rstrip()
+        f"left {left!s:>7}  {values['images_per_s']:4.1f} img/s  {gib:4.1f} GiB  lr {rate:.1e}  "
+        f"loss {values['loss']:<5.4g} {' '.join(parts)}".rstrip()
     )
 
 

@@ -68,8 +68,8 @@ VALUES = {
 def test_log_line_has_the_values_of_its_step(capsys: pytest.CaptureFixture[str]) -> None:
     training_log(35000)(120, VALUES)
     assert capsys.readouterr().err == (
-        "  120/35000  left 4:12:03   20.3 img/s  11.2 GiB  lr 1.0e-04  "
-        "loss 146.8  class 57   mask 0.0012\n"
+        "  120/35000  left 4:12:03  20.3 img/s  11.2 GiB  lr 1.0e-04  "
+        "loss 146.8 class 57   mask 0.0012\n"
     )
 
 
