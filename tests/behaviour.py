@@ -39,13 +39,13 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf/experiment").glob("*.ya
 
 TEN_STEPS = [
     *("+debug=smoke", "trainer.max_steps=10", "trainer.log_every=1", "trainer.eval_every=10"),
-    *("trainer.checkpoint_every=10", "trainer.accelerator=cpu", "trainer.threads=1"),
+    *("trainer.checkpoint_minutes=1", "trainer.accelerator=cpu", "trainer.threads=1"),
     "tracking=none",
 ]
 """Overrides of the runs that are recorded. Upstream runs get the same number of steps."""
 
 NAMING = ("vendor_id", "cpu family", "model", "stepping", "CPU implementer", "CPU part")
-MEASURED = ("images_per_s", "wait_share", "peak_memory_mib")
+MEASURED = ("images_per_s", "wait_share", "peak_memory_mib", "seconds_left")
 COUNTED = ("absent", "classes", "counts", "dataset", "names", "partition", "split")
 REL_TOL, ABS_TOL = 1e-4, 1e-6
 """Of first losses on another kind of machine; later ones differ by up to 4%."""

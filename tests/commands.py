@@ -59,7 +59,11 @@ def without_pictures() -> Iterator[None]:
 
 
 def short(steps: int) -> tuple[str, ...]:
-    return f"trainer.max_steps={steps}", f"trainer.eval_every={steps}", "trainer.checkpoint_every=2"
+    return (
+        f"trainer.max_steps={steps}",
+        f"trainer.eval_every={steps}",
+        "trainer.checkpoint_minutes=0",
+    )
 
 
 def words_of(data: Path, runs: Path, *overrides: str) -> list[str]:

@@ -38,11 +38,11 @@ SETTINGS = (
     *("+experiment=mfnet", "dataset=mfnet", "scale.batch_size=2", "scale.eval_batch_size=2"),
     *("scale.crop_hw=[64,64]", "scale.train_sizes=[64]", "scale.test_short_edge=64"),
     *(f"trainer.max_steps={STEPS}", f"trainer.eval_every={EVAL_EVERY}"),
-    *("trainer.checkpoint_every=2", "trainer.log_every=1", "trainer.accelerator=cpu"),
-    *("trainer.threads=1", "masker.patch_size=null"),
+    *("trainer.log_every=1", "trainer.accelerator=cpu", "trainer.threads=1"),
+    "masker.patch_size=null",
 )
 ENDINGS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib")
+TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib", "seconds_left")
 
 FORKS = multiprocessing.get_context("forkserver")
 
@@ -58,6 +58,7 @@ class Training:
     """One command that is rerun after every kill."""
 
     place: Path
+    minutes: str = "0"
 
     def __post_init__(self) -> None:
         self.log = self.place / "log"
@@ -68,7 +69,7 @@ class Training:
         words = (
             *(f"tracking.uri=sqlite:///{root / 'mlflow.db'}", f"dataset.root={root / 'mf'}"),
             *(f"tracking.experiment={self.place.name}", f"runs_dir={self.place}"),
-            "data.num_workers=0",
+            *("data.num_workers=0", f"trainer.checkpoint_minutes={self.minutes}"),
         )
         command = ("tests.dying", instant, "rgbt.run", *SETTINGS, *words)
         process = FORKS.Process(target=run, args=(command, {"OMP_NUM_THREADS": "1"}, str(self.log)))
@@ -154,10 +155,11 @@ def check(bench: Bench, place: Path) -> None:
     assert steps == list(range(1, STEPS + 1))
 
 
-def test_killed_at_random_instants(bench: Bench) -> None:
-    """Six kills; by the process or its whole group."""
-    draw = random.Random(0)
-    training = Training(bench.root / "random")
+@pytest.mark.parametrize("minutes", ["0", "1e-5", "10"])
+def test_killed_at_random_instants(bench: Bench, minutes: str) -> None:
+    """Six kills, of the process or its whole group; while a thread writes, too."""
+    draw = random.Random(float(minutes))
+    training = Training(bench.root / f"random_{minutes}", minutes)
     inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])
     for _ in range(6):
         process = training.start()
@@ -181,6 +183,7 @@ def test_killed_at_random_instants(bench: Bench) -> None:
 INSTANTS = (
     *("before config.yaml 1", "after run.json 1", "after mlflow.json 1", "before metrics.jsonl 1"),
     *("after counts_val.npz 1", "before best.pt 1", "before last.pt 2", "before result.json 1"),
+    *("after last.pt 3", "before best.pt 2", "before counts_val.npz 2"),  # those of step 3
 )
 
 

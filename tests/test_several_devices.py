@@ -151,7 +151,7 @@ def test_any_number_of_processes_trains_the_same_run(tmp_path: Path, experiment:
 @pytest.fixture(scope="module")
 def straight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of one process that nothing interrupts."""
-    words = settings(data, 60, "trainer.checkpoint_every=5")
+    words = settings(data, 60, "trainer.checkpoint_minutes=0")
     return Command(words, tmp_path_factory.mktemp("straight")).finished()
 
 
@@ -167,7 +167,7 @@ def straight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_killed_run_resumes_with_another_number(
     data: Path, straight: Path, tmp_path: Path, killed: str, signal_: int, code: int, number: int
 ) -> None:
-    lasting = settings(data, 60, "trainer.checkpoint_every=5")
+    lasting = settings(data, 60, "trainer.checkpoint_minutes=0")
     first = Command((*lasting, "trainer.devices=2"), tmp_path)
     first.wait_for_step(7)
     members = sorted(psutil.Process(first.process.pid).children(), key=lambda each: each.pid)

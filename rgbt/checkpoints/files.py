@@ -10,6 +10,7 @@ every entry.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import struct
 import zipfile
@@ -174,12 +175,19 @@ def save(path: Path, value: Any) -> None:
     Raises:
         OSError: the file cannot be written; an older file of this name is kept.
     """
+    digest, end = hashlib.sha256(), b""
     with replacing(path, lambda: _bytes_of(value)) as file:
-        torch.save(value, file)
-        size = file.tell() - 2  # torch ends the archive with the length of no comment
-        file.flush()
-        comment = COMMENT % _digest(Path(file.name), size)
-        file.seek(size)
+
+        def write(part: memoryview) -> None:
+            nonlocal end
+            digest.update(end)
+            digest.update(part[:-2])
+            end = bytes(part[-2:])
+            file.write(part)
+
+        torch.save(value, cast(Any, SimpleNamespace(write=write, flush=file.flush)))
+        file.seek(-2, os.SEEK_END)  # torch ends the archive with the length of no comment
+        comment = COMMENT % digest.hexdigest().encode()
         file.write(struct.pack("<H", len(comment)) + comment)
 
 

@@ -1,14 +1,16 @@
 """What a run saves: the weights that are evaluated, the state to resume from, and their files.
 
 A run starts from ``last.pt`` of its folder, else from `model.weights`, else from random weights.
-``best.pt`` is written before the ``last.pt`` that names its step, each under a temporary name. A
-process that is killed in between resumes from the state before, and makes the same weights again.
+The weights and counts of the best evaluation are written to a folder of their own, then the
+``last.pt`` that names their step; then they get their names. So the files that ``last.pt`` names
+are there whenever the process is killed (`settle`), and no others.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,14 +23,20 @@ from torch import Tensor, nn
 
 from rgbt.averaging import AveragedNetwork
 from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, save
-from rgbt.checks import InputError, RunError, one_line
+from rgbt.checks import InputError, RunError, not_finite, one_line
 from rgbt.engine.settings import TrainerSettings
+from rgbt.processes import computed_once
 
 LAST, BEST = "last.pt", "best.pt"  # names in the run folder
+NEXT = "next_"  # begins the name of a folder of files that last.pt may not name yet; their step
 UNAVERAGED = "unaveraged"  # weights of the last step, where "model" has averaged ones
 WARM_UP = 9  # the decay of step n is at most n / (n + 9), as in TensorFlow's moving average
 CHANGING = {"lr", "foreach", "fused", "capturable"}  # set before every step, or by the device
 Count = Annotated[int, Ge(0)]
+ADVICE = "Lower optimizer.lr, or set trainer.precision=32-true; the last checkpoint is kept."
+
+# The content of ``best.pt``, and what writes the other files of its evaluation into a folder.
+Best = tuple[dict[str, Any], Callable[[Path], None]]
 
 
 class EvaluatedWeights:
@@ -216,20 +224,58 @@ def _check_states(optimizer: torch.optim.Optimizer, stored: Any) -> None:
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
-def commit(folder: Path, payload: dict[str, Any], state: State) -> None:
-    """Write the weights if this step is the best, then the state, to a run folder."""
+def best_payload(weights: dict[str, Tensor], state: State) -> dict[str, Any]:
+    """Gather what ``best.pt`` holds, of the evaluation of this step."""
+    origin = {"key": state.key, "settings": state.settings}
+    return {"model": weights, "step": state.step, NOTE: origin}
+
+
+def commit(folder: Path, payload: dict[str, Any], best: Best | None) -> None:
+    """Write the state, and the files of the evaluation that it names if they are not there yet.
+
+    RunError: weights are not finite; OSError: as `save`. Then the files are as they were.
+    """
+    step = payload["state"]["step"]
+    for weights in (payload["model"], payload.get(UNAVERAGED, {}), *payload["others"].values()):
+        check_finite(weights, step)
     folder.mkdir(parents=True, exist_ok=True)
-    if state.step == state.best_step > 0:
-        origin = {"key": state.key, "settings": state.settings}
-        save(folder / BEST, {"model": payload["model"], "step": state.step, NOTE: origin})
+    if best is not None:
+        settle(folder, 0)
+        coming = folder / f"{NEXT}{payload['state']['best_step']}"
+        coming.mkdir()
+        weights, write_files = best
+        write_files(coming)
+        save(coming / BEST, weights)
     save(folder / LAST, payload)
+    settle(folder, payload["state"]["best_step"])
+
+
+def settle(folder: Path, best_step: int) -> None:
+    """Name the files that were written for ``last.pt`` with this best step, and remove others."""
+    for coming in folder.glob(f"{NEXT}*"):
+        if coming.name == f"{NEXT}{best_step}":
+            for file in filter(Path.is_file, coming.rglob("*")):
+                target = folder / file.relative_to(coming)
+                target.parent.mkdir(exist_ok=True)
+                file.replace(target)
+        shutil.rmtree(coming)
+
+
+def check_finite(weights: Mapping[str, Tensor], step: int) -> None:
+    """Refuse to evaluate or save parameters and buffers that are not finite, by RunError."""
+    for name in not_finite(weights):
+        raise RunError(f"step {step}: '{name}' holds NaN or infinity. {ADVICE}")
 
 
 def load_last(folder: Path) -> tuple[dict[str, Any], State]:
-    """Load the last checkpoint of a run folder and its state; RunError: a file is unusable."""
+    """Load the last checkpoint of a run folder and its state; RunError: a file is unusable.
+
+    Process 0 names what a killed process left (`settle`).
+    """
     with _saying_what_to_do(folder):
         payload = load_checkpoint(folder / LAST)
         state = State.of(payload)
+    computed_once(lambda: settle(folder, state.best_step))
     if state.best_step:
         load_best(folder, state)
     return payload, state
@@ -242,8 +288,7 @@ def load_best(folder: Path, state: State) -> dict[str, Any]:
         payload = load_checkpoint(best)
         check_origin(payload, best, state.key, state.settings)
         found = step_of(payload, best)
-        # Weights of a later step were written just before the run was killed.
-        if found != state.best_step and found <= state.step:
+        if found != state.best_step:
             raise InputError(f"{best} is of step {found}, not of {state.best_step}")
     return dict(payload["model"])
 

@@ -5,9 +5,13 @@ A training that becomes much slower says so.
 
 from __future__ import annotations
 
+import math
 import os
+import sys
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from datetime import timedelta
 from statistics import fmean, median
 
 from rich.console import Console
@@ -21,11 +25,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from rgbt.checks import without_controls
 from rgbt.cores import usable_cores
 from rgbt.terminal import warn
 
 # A training is slow when its last steps take so many times as long as its first ones.
 SLOWER, NUM_FIRST, NUM_LAST = 10, 100, 10
+
+# Lines of a training that are written without a pause, and seconds between two later ones.
+NUM_AT_ONCE, PAUSE_S = 10, 10.0
 
 # Progress goes to stderr; stdout is for results.
 CONSOLE = Console(stderr=True)
@@ -33,7 +41,7 @@ CONSOLE = Console(stderr=True)
 
 def progress() -> Progress:
     """Make a progress display with columns for count, time left and a note (task field `note`)."""
-    # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
+    # Drawing ten times a second takes 2 % of a core. In a file it would be one long line.
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description:<10}", markup=False),
@@ -45,7 +53,55 @@ def progress() -> Progress:
         TextColumn("{task.fields[note]}", markup=False),
         console=CONSOLE,
         refresh_per_second=4,
-        auto_refresh=CONSOLE.is_terminal,
+        disable=not CONSOLE.is_terminal,
+    )
+
+
+def training_log(total: int) -> Callable[[int, Mapping[str, float]], None]:
+    """Return a function that writes the values of a step as a line, unless a bar shows them.
+
+    The first `NUM_AT_ONCE` lines and that of the last step, `total`, are always written, the others
+    at most every `PAUSE_S` seconds.
+    """
+    count, written_at = 0, -math.inf
+
+    def write(step: int, values: Mapping[str, float]) -> None:
+        nonlocal count, written_at
+        now = time.monotonic()
+        if count >= NUM_AT_ONCE and step < total and now - written_at < PAUSE_S:
+            return
+        count, written_at = count + 1, now
+        _write(step, total, _in_words(values))
+
+    return write
+
+
+def write_evaluation(
+    step: int, total: int, split: str, score: float, best: tuple[float, int]
+) -> None:
+    """Write the mIoU of a split, and the best one so far with its step, unless a bar is shown."""
+    best_score, best_step = best
+    of_best = f", best {100 * best_score:.2f} % at step {best_step}" if best_score >= 0 else ""
+    _write(step, total, f"{split} mIoU {100 * score:.2f} %{of_best}")
+
+
+def _write(step: int, total: int, text: str) -> None:
+    if not CONSOLE.is_terminal:
+        sys.stderr.write(without_controls(f"{step:>{len(str(total))}}/{total}  {text}") + "\n")
+
+
+def _in_words(values: Mapping[str, float]) -> str:
+    """Columns of one width, then the parts of the loss: "left 4:12:03  20.3 img/s ..."."""
+    left = timedelta(seconds=round(values["seconds_left"]))
+    gib = values["peak_memory_mib"] / 2**10
+    rate = max(value for name, value in values.items() if name.startswith("lr/"))
+    parts = []
+    for name, value in values.items():
+        if name.startswith("loss/"):
+            parts.append(f"{name.removeprefix('loss/')} {value:<4.2g}")
+    return (
+        f"left {left!s:>7}  {values['images_per_s']:4.1f} img/s  {gib:4.1f} GiB  lr {rate:.1e}  "
+        f"loss {values['loss']:<5.4g} {' '.join(parts)}".rstrip()
     )
 
 

@@ -20,7 +20,8 @@ Precision = Literal["32-true", "bf16-mixed"]
 MACHINE_SETTINGS = (
     "accelerator",
     "log_every",
-    "checkpoint_every",
+    "checkpoint_minutes",
+    "checkpoint_evaluations",
     "devices",
     "activation_checkpointing",
     "memory_format",
@@ -45,7 +46,8 @@ class TrainerSettings:
 
     max_steps: ranges.NumSteps
     eval_every: ranges.NumSteps
-    checkpoint_every: ranges.NumSteps
+    checkpoint_minutes: Annotated[float, Interval(ge=0, le=1440)] = 10.0
+    checkpoint_evaluations: bool = False
     log_every: ranges.NumSteps
     accumulate: Annotated[int, Interval(ge=1, le=10_000)]
     clip_norm: ranges.Positive | None

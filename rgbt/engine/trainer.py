@@ -10,19 +10,26 @@ import math
 import resource
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, RunError, not_finite
+from rgbt.checks import InputError, RunError
 from rgbt.engine.batch_norm import share_running_statistics
 from rgbt.engine.checkpoint import (
+    ADVICE,
+    BEST,
     LAST,
+    Best,
     EvaluatedWeights,
     State,
+    best_payload,
+    check_finite,
     check_origin,
     commit,
     load_last,
@@ -31,8 +38,9 @@ from rgbt.engine.checkpoint import (
     training_payload,
 )
 from rgbt.engine.device import compiles_functions
+from rgbt.engine.host_copy import Copies, copied, reserve
 from rgbt.engine.optimizers import step_without_gradient
-from rgbt.engine.progress import progress, watch_pace
+from rgbt.engine.progress import progress, training_log, watch_pace, write_evaluation
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.fusion import compile_fused
@@ -55,13 +63,12 @@ Values = dict[str, float]
 Phases = Callable[[StepData, GeneratorOf], Iterator[Phase]]
 
 WAIT_SHARE = "wait_share"  # share of a step spent waiting for its images
-ADVICE = "Lower optimizer.lr, or set trainer.precision=32-true; the last checkpoint is kept."
 
 
 class Hooks:
     """Lets a run act around its steps, in the order of these methods; they do nothing here.
 
-    Of several processes, each calls `log`, `evaluate` and `keep`; `after_step` and `committed` are
+    Of several processes, each calls `log`, `evaluate` and `keep`; `after_step` and `show` are
     called by the process that writes.
     """
 
@@ -78,11 +85,15 @@ class Hooks:
         """
         return None
 
-    def keep(self) -> None:
-        """Keep the files of this evaluation: its weights are the best, and are saved next."""
+    def keep(self) -> Callable[[Path], None]:
+        """Return what writes the files of this evaluation, whose weights are the best, to a folder.
 
-    def committed(self) -> None:
-        """Show what is new, after the evaluation was saved; a signal interrupts it."""
+        A thread calls it with the next checkpoint.
+        """
+        return lambda _: None
+
+    def show(self) -> None:
+        """Show what is new after an evaluation; a signal interrupts it."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -113,6 +124,11 @@ class Trainer:
     def __post_init__(self) -> None:
         self.weights = EvaluatedWeights(self.model, self.settings)
         self.note_pace = watch_pace(self.settings.threads)
+        self._copies: Copies = {}  # what is being written, and the best weights
+        self._best: Best | None = None  # to be written with the next checkpoint
+        self._thread: ThreadPoolExecutor
+        self._writing: Future[Any] | None = None
+        self._saved_at = time.monotonic()
 
     def resume(self, state: State) -> bool:
         """Restore everything from the last checkpoint into `state`; False if there is none.
@@ -145,24 +161,33 @@ class Trainer:
             Stopped: a signal came; it waits for the step, and its `step` is saved.
         """
         total = self.settings.max_steps
+        begun_at, first, write = time.monotonic(), state.step, training_log(total)
+        self._saved_at = begun_at
         functions = compile_fused(compiles_functions(self.settings, self.fabric.device))
-        with progress() as display, deferred(), functions:
-            task = display.add_task("training", total=total, completed=state.step, note="")
+        with progress() as display, deferred(), ThreadPoolExecutor(1) as self._thread, functions:
+            task = display.add_task("training", total=total, completed=first, note="")
             if self._is_due(state):  # a signal came before its evaluation
                 self._evaluate_and_save(state)
             self.model.train()
-            for step in range(state.step, total):
+            for step in range(first, total):
                 values = self._step(step, batches, state.seed)
                 state.step = step + 1
                 self.weights.update(state.step)
+                if step == first and self.writes:
+                    self._writing = self._thread.submit(reserve(self._saved(state), self._copies))
+                done = (state.step - first) / (total - first)
+                values["seconds_left"] = (time.monotonic() - begun_at) * (1 / done - 1)
                 note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
                 display.update(task, completed=state.step, note=note)
                 # Steps may alternate between phases: a line has the last values of each.
                 state.unlogged |= values
                 if state.step % self.settings.log_every == 0 or state.step == total:
                     self.hooks.log(state.step, state.unlogged)
+                    write(state.step, state.unlogged)
                     state.unlogged = {}
                 self._evaluate_and_save(state)
+            self._wait()
+            self._copies = {}
 
     def _step(self, step: int, batches: Iterator[StepData], seed: int) -> Values:
         """Make one optimizer step of every phase; returns the values to log."""
@@ -258,12 +283,15 @@ class Trainer:
 
     def _evaluate_and_save(self, state: State) -> None:
         """Evaluate and save if this step is due; save and stop if a signal came to any process."""
-        due, signalled = self._is_due(state), largest(noted())
-        saves = due or state.step % self.settings.checkpoint_every == 0
-        if saves or signalled:
+        due, request = self._is_due(state), largest(self._request())
+        signalled = max(0, request - 1)
+        is_last = state.step == self.settings.max_steps
+        saves = bool(request) or (due and (is_last or self.settings.checkpoint_evaluations))
+        if due or saves:
             self._exchange(state)
         if due:
-            self._check_weights(state)
+            for module in (self.model, *self.others.values()):
+                check_finite(module.state_dict(), state.step)
         try:
             raise_noted(signalled)
             if self.writes:  # a signal to another process alone waits for the next step
@@ -278,11 +306,22 @@ class Trainer:
                 self.model.train()
             if due and self.writes:
                 with at_once():
-                    self.hooks.committed()
+                    self.hooks.show()
         except Stopped as stop:
             self._save(state)
+            self._wait()
             stop.step = state.step
             raise
+
+    def _request(self) -> int:
+        """Return 1 + the number of a signal, else 1 where a checkpoint is due by time, or 0."""
+        if self._writing is not None and self._writing.done():
+            self._wait()
+        if number := noted():
+            return 1 + number
+        wanted, minutes = self.settings.checkpoint_minutes, (time.monotonic() - self._saved_at) / 60
+        is_free = self._writing is None or wanted == 0  # else it is put off
+        return int(self.writes and is_free and minutes >= wanted)
 
     def _exchange(self, state: State) -> None:
         """Collect what every process has by itself, before it is saved."""
@@ -291,12 +330,6 @@ class Trainer:
         if self.settings.batch_norm_parts > 1:
             for module in (self.model, self.weights.network, *self.others.values()):
                 share_running_statistics(module)
-
-    def _check_weights(self, state: State) -> None:
-        """Refuse to evaluate or save parameters and buffers that are not finite, by RunError."""
-        for module in (self.model, *self.others.values()):
-            for name in not_finite(module.state_dict()):
-                raise RunError(f"step {state.step}: '{name}' holds NaN or infinity. {ADVICE}")
 
     def _select(self, state: State) -> None:
         """Evaluate, and keep the weights if they are the best so far or if the last are tested.
@@ -313,16 +346,41 @@ class Trainer:
             keeps |= math.isnan(score)
         if keeps:
             state.best_step = state.step
-            self.hooks.keep()
+            self._keep(state, self.hooks.keep())
         state.evaluated_step = state.step
+        if score is not None and self.writes:
+            split, best = self.settings.selection_split, (state.best_score, state.best_step)
+            write_evaluation(state.step, self.settings.max_steps, split, score, best)
+
+    def _keep(self, state: State, write_files: Callable[[Path], None]) -> None:
+        """Copy the weights of this evaluation, which the next checkpoint names as the best."""
+        if self.writes:
+            self._wait()  # for the thread that may be writing those of the last one
+            weights = copied({BEST: self.weights.network.state_dict()}, self._copies)[BEST]
+            self._best = best_payload(weights, state), write_files
 
     def _save(self, state: State) -> None:
-        """Save the checkpoint of this step, in the process that writes."""
-        if self.writes:
-            self._check_weights(state)
-            weights = self.weights.state()
-            payload = training_payload(weights, self.others, self.optimizers, state)
-            commit(self.folder, payload, state)
+        """Copy the state of this step, in the process that writes, and let the thread write it."""
+        if not self.writes:
+            return
+        self._wait()
+        payload = copied({LAST: self._saved(state)[LAST]}, self._copies)[LAST]
+        self._writing = self._thread.submit(commit, self.folder, payload, self._best)
+        self._best, self._saved_at = None, time.monotonic()
+        if self.settings.checkpoint_minutes == 0:
+            self._wait()
+
+    def _saved(self, state: State) -> dict[str, Any]:
+        """Return what the two files hold, on the device."""
+        weights = self.weights.state()
+        payload = training_payload(weights, self.others, self.optimizers, state)
+        return {LAST: payload, BEST: weights["model"]}
+
+    def _wait(self) -> None:
+        """Wait until the thread has written its files, and raise its error if there is one."""
+        writing, self._writing = self._writing, None
+        if writing is not None:
+            writing.result()
 
 
 def _add(values: Values, more: Values) -> None:

@@ -7,9 +7,10 @@ decides that where it opens the run folder (`RunFolder.writes`), and nothing els
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from omegaconf import OmegaConf
 from torch import nn
@@ -253,11 +254,13 @@ class Training(Hooks):
         self.state.skip(result.skipped)
         return values[names.MIOU]
 
-    def keep(self) -> None:
-        """Save the counts of the evaluation, which are those of the best weights."""
-        self._save(self.selected)
+    def keep(self) -> Callable[[Path], None]:
+        """Return what writes the counts of the evaluation, which are those of the best weights."""
+        session = self._session_of(self.session.model, 0)
+        counts = self.selected
+        return lambda folder: save_counts(replace(session, folder=folder), counts)
 
-    def committed(self) -> None:
+    def show(self) -> None:
         """Send the evaluation to the tracker."""
         self.tracking.update()
 

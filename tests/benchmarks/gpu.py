@@ -97,8 +97,8 @@ def set_up(network: str, precision: str, setting: str, root: Path, device: str) 
     words = ["+experiment=crm", "tracking=none", f"trainer.accelerator={device}"]
     words += ["scale=paper", f"model=mask2former_{network}", f"dataset.root={root}"]
     words += [f"trainer.precision={PRECISIONS[precision]}", f"data.cache={root / 'cache'}"]
-    words += [f"trainer.{name}={NEVER}" for name in ("max_steps", "eval_every", "checkpoint_every")]
-    words += ["trainer.log_every=1", *filter(None, [setting])]
+    words += [f"trainer.{name}={NEVER}" for name in ("max_steps", "eval_every")]
+    words += ["trainer.checkpoint_minutes=1440", "trainer.log_every=1", *filter(None, [setting])]
     words += ["data.num_workers=0"] if "num_workers" not in setting else []
     if device == "cpu":
         words += ["model=mask2former_tiny", "recipe.batch_size=2", "scale.crop_hw=[64,80]"]

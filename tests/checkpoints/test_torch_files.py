@@ -24,6 +24,7 @@ from rgbt.checkpoints.files import read, save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import (
     State,
+    best_payload,
     commit,
     load_best,
     load_checkpoint,
@@ -188,7 +189,8 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     with pytest.raises(InputError, match=f"counts of the run {other.name}"):
         RunResult(folder).counts()
     state = State(seed=3, step=7, best_step=7, key="a", settings="b")
-    commit(tmp_path / "a", payload() | {"state": asdict(state)}, state)
+    best = best_payload(payload()["model"], state), lambda _: None
+    commit(tmp_path / "a", payload() | {"state": asdict(state)}, best)
     assert load_best(tmp_path / "a", state).keys() == payload()["model"].keys()
     with pytest.raises(RunError, match="belongs to the run a, not to c"):
         load_best(tmp_path / "a", replace(state, key="c"))

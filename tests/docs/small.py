@@ -13,7 +13,7 @@ from pathlib import Path
 SMOKE = ("+debug=smoke", "trainer.accelerator=cpu", "trainer.threads=1")
 ENOUGH = "dataset.num_test=12"
 """Images without which no two methods are compared; of a page that compares."""
-SIZES = ("trainer.max_steps", "trainer.eval_every", "trainer.checkpoint_every", "+debug")
+SIZES = ("trainer.max_steps", "trainer.eval_every", "trainer.checkpoint_minutes", "+debug")
 SIZES += ("scale.max_steps", "scale.eval_every", "scale.batch_size", "data.batch_size")
 COMPARING = ("rgbt compare", "rgbt figures", "compare(")
 STORE = ("rgbt sync", "rgbt ui", "mlflow", "tracking")

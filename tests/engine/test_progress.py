@@ -1,13 +1,17 @@
-"""A training that becomes much slower says so, once."""
+"""A training writes lines that one can follow, and says once that it became much slower."""
 
 from __future__ import annotations
 
+import io
+import math
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
-from rgbt.engine.progress import watch_pace
+from rgbt.engine.progress import progress, training_log, watch_pace, write_evaluation
 
 
 def warned(
@@ -52,3 +56,65 @@ def test_pace_compares_with_a_start_below_a_hundred_steps(
     *before, last = warned(watch_pace(1), capsys, *[0.1] * 30, *[2.0] * 5)
     assert not any(before)
     assert "1.05 s now, 10 times" in last
+
+
+VALUES = {
+    **{"loss/class": 56.897, "loss/mask": 0.001234, "loss": 146.769, "grad_norm": 69.5},
+    **{"images_per_s": 20.34, "lr/main_0": 1e-5, "lr/main_1": 1e-4, "peak_memory_mib": 11468.8},
+    "seconds_left": 15123.4,
+}
+
+
+def test_log_line_has_the_values_of_its_step(capsys: pytest.CaptureFixture[str]) -> None:
+    training_log(35000)(120, VALUES)
+    assert capsys.readouterr().err == (
+        "  120/35000  left 4:12:03  20.3 img/s  11.2 GiB  lr 1.0e-04  "
+        "loss 146.8 class 57   mask 0.0012\n"
+    )
+
+
+def test_log_line_of_crm_fits_in_120_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    parts = dict.fromkeys(("class", "mask", "dice", "sdc", "sdn"), 0.1234)
+    training_log(35000)(120, {**VALUES, **{f"loss/{name}": v for name, v in parts.items()}})
+    assert len(capsys.readouterr().err.rstrip()) <= 120
+
+
+def test_log_has_ten_lines_then_one_in_ten_seconds(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("rgbt.engine.progress.time", SimpleNamespace(monotonic=lambda: now[0]))
+    write = training_log(100)
+    for step in range(1, 101):
+        now[0] += 1
+        write(step, VALUES)
+    steps = [int(line.split("/")[0]) for line in capsys.readouterr().err.splitlines()]
+    assert steps == [*range(1, 11), *range(20, 100, 10), 100]
+
+
+def test_bar_of_a_terminal_replaces_the_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = io.StringIO()
+    console = Console(file=shown, force_terminal=True, width=120)
+    monkeypatch.setattr("rgbt.engine.progress.CONSOLE", console)
+    with progress() as display:
+        display.add_task("training", total=3, note="loss 1.0")
+        training_log(3)(1, VALUES)
+        write_evaluation(1, 3, "val", 0.5, (0.5, 1))
+    assert capsys.readouterr().err == ""
+    assert "loss 1.0" in shown.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("score", "best", "said"),
+    [
+        (0.4321, (0.45, 3), "val mIoU 43.21 %, best 45.00 % at step 3"),
+        (math.nan, (-1.0, 9), "val mIoU nan %"),
+    ],
+)
+def test_line_of_an_evaluation(
+    capsys: pytest.CaptureFixture[str], score: float, best: tuple[float, int], said: str
+) -> None:
+    write_evaluation(9, 35000, "val", score, best)
+    assert capsys.readouterr().err == f"    9/35000  {said}\n"

@@ -28,7 +28,7 @@ from tests.checkpoints.test_torch_files import same
 SETTINGS = {
     "max_steps": 6,
     "eval_every": 3,
-    "checkpoint_every": 2,
+    "checkpoint_minutes": 0,
     "log_every": 1,
     "accumulate": 1,
     "clip_norm": 1.0,
@@ -175,8 +175,9 @@ def test_weights_not_finite_are_neither_saved_nor_evaluated(
     with pytest.raises(RunError, match=rf"step {poisoned}: '2.bias' holds NaN or infinity"):
         trainer.fit(batches(0), State(seed=7))
     assert evaluated == []
-    # Step 2 writes a checkpoint, step 3 would evaluate.
-    assert (tmp_path / "last.pt").exists() == (poisoned == 3)
+    # Every step writes a checkpoint, step 3 would evaluate.
+    assert (tmp_path / "last.pt").exists()
+    assert load_checkpoint(tmp_path / "last.pt")["state"]["step"] == poisoned - 1
 
 
 class Alternating:
@@ -219,13 +220,13 @@ def test_resume_equals_straight_through(tmp_path: Path) -> None:
         first.fit(batches(0), State(seed=7))
     second, state = make_two(tmp_path / "b"), State(seed=7)
     assert second.resume(state)
-    assert state.step == 4  # the last checkpoint, written every second step
+    assert state.step == 5
     second.fit(batches(state.step), state)
     assert (state.best_step, state.best_score) == (6, 6.0)
     ends = [load_checkpoint(tmp_path / where / "last.pt") for where in ("a", "b")]
     assert all(same(ends[0][part], ends[1][part]) for part in ("model", "others", "optimizers"))
     assert "1.running_mean" in ends[0]["others"]["judge"]
-    assert [v["loss"] for _, v in straight.log[4:]] == [v["loss"] for _, v in second.log]
+    assert [v["loss"] for _, v in straight.log[5:]] == [v["loss"] for _, v in second.log]
     logged = straight.log[0][1]
     assert {"grad_norm/main", "grad_norm/judge"} <= set(logged)
     assert logged["loss"] == pytest.approx(logged["loss/fit"] + logged["loss/judge"])
@@ -392,7 +393,7 @@ def test_rates_of_parts_follow_schedule_in_two_sessions(tmp_path: Path, head_rat
         yield Phase(("main",), {"fit": seen.square().mean()})
 
     for stop in (3, 5):
-        trainer, log = make(tmp_path, max_steps=stop, checkpoint_every=1)
+        trainer, log = make(tmp_path, max_steps=stop, checkpoint_minutes=0)
         optimizer = sgd(model, lr=0.1, backbone_multiplier=0.5, head_rate=head_rate)
         trainer = replace(trainer, model=model, optimizers={"main": optimizer})
         trainer.phases = phases

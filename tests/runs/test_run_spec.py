@@ -32,7 +32,8 @@ SAME = (
     "runs_dir=/elsewhere dataset.cache_dir=/cache tracking=none fresh=true",
     "trainer.accelerator=cpu trainer.devices=1 trainer.compile=none",
     "data.num_workers=1 data.on_error=skip data.eval_batch_size=3",
-    *("trainer.log_every=3 trainer.checkpoint_every=7", "seeds.order=0 seeds.weights=0"),
+    *("trainer.log_every=3 trainer.checkpoint_minutes=7", "trainer.checkpoint_evaluations=true"),
+    "seeds.order=0 seeds.weights=0",
 )
 OTHER = (
     *("seed=1", "seeds.weights=1", "seeds.order=1", "seeds.masks=1", "masker=irm"),

@@ -45,7 +45,7 @@ def sending(number: signal.Signals, step: int, times: int = 1) -> Iterator[Batch
 
 
 def train(folder: Path, **changes: object) -> tuple[Trainer, list]:
-    return make(folder, max_steps=6, checkpoint_every=100, eval_every=3, log_every=4, **changes)
+    return make(folder, max_steps=6, checkpoint_minutes=1440, eval_every=3, log_every=4, **changes)
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     settings: dict[str, Any] = {
         "max_steps": steps,
         "eval_every": 1000,
-        "checkpoint_every": 1000,
+        "checkpoint_minutes": 1440,
         "log_every": 1,
         "accumulate": 1,
         "clip_norm": None,

@@ -378,7 +378,7 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path: Path, changes: dict[str, 
     def fit(folder: Path, steps: int, state: State) -> Any:
         model = network(False)
         scheme = scheme_of(model, jitter=0.5, masked_images="both", **changes)
-        made = trainer(scheme, model, folder, 6, checkpoint_every=1, max_steps=6)
+        made = trainer(scheme, model, folder, 6, checkpoint_minutes=0, max_steps=6)
         assert made.resume(state) == (state.step > 0 or (folder / "last.pt").exists())
         made.settings = replace(made.settings, max_steps=steps)
         made.fit(pairs(first=state.step), state)

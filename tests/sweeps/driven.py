@@ -18,9 +18,6 @@ from tests.commands import logged, words_of
 from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]
-EVERY = 4
-"""Steps between two checkpoints."""
-
 FORKS = multiprocessing.get_context("forkserver")
 
 
@@ -52,7 +49,7 @@ class Sweep:
     def start(self, *more: str) -> BaseProcess:
         """A call of the command, in a process group of its own."""
         length = (f"trainer.max_steps={self.steps}", f"trainer.eval_every={self.steps // 2}")
-        own = ("+experiment=grbm", *length, f"trainer.checkpoint_every={EVERY}", self.varied)
+        own = ("+experiment=grbm", *length, "trainer.checkpoint_minutes=0", self.varied)
         words = ("rgbt.run", "-m", *words_of(self.data, self.runs, *own), *self.words, *more)
         return self.call(words)
 
