@@ -40,6 +40,7 @@ class Sweep:
         data: a small data set.
         steps: of each run.
         varied: what is swept.
+        options: () for a command of one run.
     """
 
     runs: Path
@@ -47,14 +48,15 @@ class Sweep:
     words: tuple[str, ...] = ()
     steps: int = 10
     varied: str = "seed=0,1,2,3"
+    options: tuple[str, ...] = ("-m",)
     calls: int = 0
 
     def start(self, *more: str) -> BaseProcess:
         """A call of the command, in a process group of its own."""
         length = (f"trainer.max_steps={self.steps}", f"trainer.eval_every={self.steps // 2}")
         own = ("+experiment=grbm", *length, f"trainer.checkpoint_every={EVERY}", self.varied)
-        words = ("rgbt.run", "-m", *words_of(self.data, self.runs, *own), *self.words, *more)
-        return self.call(words)
+        words = (*words_of(self.data, self.runs, *own), *self.words, *more)
+        return self.call(("rgbt.run", *self.options, *words))
 
     def call(self, words: Sequence[str]) -> BaseProcess:
         """Another command about these runs."""
