@@ -85,7 +85,7 @@ def device_line(session: Session) -> str:
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
     count = torch.get_num_threads()
     threads = f"{count} thread{'s' * (count > 1)}"
-    precision = session.trainer.precision
+    precision: str = session.trainer.precision
     if device.type == "cuda":
         precision += f", matmul_precision={session.trainer.matmul_precision}"
     if number > 1:

@@ -73,10 +73,8 @@ class Driver:
             if self.settings.stop_jobs or not self.executor.is_lasting:
                 self._stop()
             elif self.running:
-                jobs = (
-                    f"{len(self.running)} jobs continue" if self.running[1:] else "1 job continues"
-                )
-                self.view.say("note", f"{jobs} without this command.")
+                number = len(self.running)
+                self.view.say("note", f"jobs that continue without this command: {number}.")
             raise
 
     def _step(self) -> bool:

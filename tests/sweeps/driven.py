@@ -125,7 +125,8 @@ def steps(folder: Path) -> list[int]:
 def facts(folder: Path) -> dict[str, Any]:
     """All of a finished run that must not depend on where and in how many parts it is trained."""
     result = dict(RunResult(folder).result)
-    del result["seconds_of_last_process"]
+    for name in ("seconds_of_last_process", "name"):  # the name says what is varied
+        del result[name]
     lines = [
         (line["step"], {k: v for k, v in line["values"].items() if k.startswith("loss")})
         for line in logged(folder, "train")

@@ -120,7 +120,7 @@ def test_one_run_is_a_job_that_outlives_its_command(sweep: Sweep, straight: Swee
     assert process.pid is not None
     os.kill(process.pid, signal.SIGTERM)
     assert sweep.end(process) == 143
-    assert "1 job continues without this command" in sweep.text
+    assert "jobs that continue without this command: 1." in sweep.text
     (job,) = set(queue()) - before
     assert re.search(rf"queued +grbm-\w+, job {job}\n", sweep.text), sweep.text
     said = sweep.finish()  # which follows the same job
