@@ -25,6 +25,7 @@ ROWS = {
     "tf32": "TF32 (default)",
     "fp32": "float32 (matmul_precision=highest)",
     "bf16": "bf16-mixed, TF32",
+    "bf16_decoder": "bf16-mixed, pixel decoder too",
     "release": "TF32, beside the release",
     "tests": "",
     "loader_cache": "TF32, 4 loaders, decoded cache",
@@ -103,7 +104,7 @@ def share_of_peak(row: str, found: dict[str, Any], rows: dict[str, dict[str, Any
     for pattern, peaks in PEAKS.items():
         if flops and names and fnmatch(names[0].removeprefix("NVIDIA "), pattern):
             rate = flops / found["ms a step"] / 1e9
-            return f"{100 * rate / peaks[row == 'bf16']:.1f} %"
+            return f"{100 * rate / peaks[row.startswith('bf16')]:.1f} %"
     return "unknown"
 
 

@@ -40,6 +40,7 @@ ROWS = {
     "tf32": (),
     "fp32": ("trainer.matmul_precision=highest",),
     "bf16": ("trainer.precision=bf16-mixed",),
+    "bf16_decoder": ("trainer.precision=bf16-mixed", "model.pixel_decoder_fp32=false"),
     "release": (),
     "loader_cache": ("data.num_workers=4",),
     "loader_files": ("data.num_workers=4", "data.cache=null"),
