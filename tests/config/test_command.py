@@ -118,7 +118,7 @@ study = command(sweeper="study")(failing)
     [
         (("hydra/launcher=joblib",), "hydra/launcher=joblib: "),
         (("hydra/launcher=slurm",), "there is no hydra/launcher 'slurm'"),
-        (("hydra/launcher=ray", "seed=0,1"), "'seed=0,1'"),
+        (("hydra/launcher=ray", "seed=0,1", "hydra.sweeper.dry_run=true"), "'seed=0,1'"),
         (("hydra/launcher=ray", "trainer.max_stps=1"), "'trainer.max_stps' is not a key"),
         (("hydra/launcher=ray", "hydra.launcher.gpu=1"), "'hydra.launcher.gpu' is not a key"),
         (("hydra/launcher=ray", "hydra.sweeper.waits=false"), "hydra.sweeper.waits"),
