@@ -78,8 +78,7 @@ def in_process(words: list[str], limit_s: float, **variables: str) -> tuple[int 
 def run_tests(device: str, limit_s: float) -> dict[str, Any]:
     """Outcome of the tests marked gpu."""
     words = ["pytest", "-m", "gpu and not slow", TESTS[device]]
-    variables = {"RGBT_TEST_DEVICE": device, "PYTHONDONTWRITEBYTECODE": "1"}
-    code, out, _ = in_process(words, limit_s, **variables)
+    code, out, _ = in_process(words, limit_s, RGBT_TEST_DEVICE=device)
     if code is None:
         return {"failed": f"not finished after {limit_s:.0f} s"}
     outcome = out.strip().splitlines()[-1].strip("= ") if out.strip() else f"exit code {code}"
@@ -121,12 +120,13 @@ def line(title: str, found: dict[str, Any]) -> str:
 
 def examined(found: dict[str, Any]) -> str:
     """What one step executes."""
-    lines = [
-        f"\nA step: {found['flops'] / 1e12:.3g} TFLOP, {found['kernels']} kernels and copies in "
-        f"{found['kernel ms']:.4g} ms. The longest:\n",
-        "| kernel | ms | calls |",
-        "|---|---|---|",
-    ]
+    lines = [f"\n{name}: {text}" for name, text in found.items() if name.endswith(" failed")]
+    if "flops" in found:
+        lines.append(f"\nA step has {found['flops'] / 1e12:.3g} TFLOP.")
+    if "top" not in found:
+        return "\n".join(lines)
+    lines.append(f"\nIt is {found['kernels']} kernels and copies in {found['kernel ms']:.4g} ms:\n")
+    lines += ["| kernel | ms | calls |", "|---|---|---|"]
     for kernel in found["top"]:
         lines.append(f"| `{kernel['name'][:90]}` | {kernel['ms']:.3g} | {kernel['calls']} |")
     return "\n".join(lines)
@@ -196,7 +196,7 @@ def conclude(report: dict[str, Any], out: Path) -> None:
         print(f"\nThe release needs {rows['release']['ratio']:.3g} times our time for a step.")
     if "tests" in rows:
         print(f"\nTests marked gpu: {' '.join(rows['tests'].values())}.")
-    if "top" in rows.get("tf32", {}):
+    if "machine" in rows.get("tf32", {}):
         print(examined(rows["tf32"]))
     if report["not reached"]:
         print(f"\nNot reached in the time: {', '.join(report['not reached'])}.")

@@ -11,8 +11,8 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from itertools import repeat
 from pathlib import Path
 from statistics import median
@@ -135,17 +135,12 @@ def watched(
     device: torch.device,
     ours: list[tuple[float, float]],
     between: Callable[[], object],
-    after: Sequence[AbstractContextManager[Any]],
 ) -> Iterator[Any]:
-    """Give batches to a training: steps to be timed, then one in each context of `after`."""
+    """Give batches to a training, whose steps are timed."""
     for _ in range(sum(STEPS[device.type])):
         with timed(device, ours):
             yield next(batches)
         between()
-    for context in after:
-        with context:
-            yield next(batches)
-            now(device)
 
 
 def train(setup: TrainingSetup, batches: Iterator[Any], folder: Path) -> list[dict[str, float]]:
@@ -188,10 +183,23 @@ def release_call(checkout: Path, setup: TrainingSetup, batch: Any) -> Callable[[
     )
 
 
-def kernels(profiled: Any, device: torch.device) -> dict[str, Any]:
+def operations(step: Callable[[], object], _: torch.device) -> dict[str, Any]:
+    """Operations of one step, a multiplication and its addition being two."""
+    with FlopCounterMode(display=False) as counter:
+        step()
+    return {"flops": counter.get_total_flops()}
+
+
+def kernels(step: Callable[[], object], device: torch.device) -> dict[str, Any]:
     """Kernels and copies of one step; on a CPU operators."""
-    kind = DeviceType.CUDA if device.type == "cuda" else DeviceType.CPU
-    name = "self_device_time_total" if device.type == "cuda" else "self_cpu_time_total"
+    on_gpu = device.type == "cuda"
+    activity, kind = ProfilerActivity.CPU, DeviceType.CPU
+    if on_gpu:
+        activity, kind = ProfilerActivity.CUDA, DeviceType.CUDA
+    with profile(activities=[activity]) as profiled:
+        step()
+        now(device)
+    name = "self_device_time_total" if on_gpu else "self_cpu_time_total"
     rows = [row for row in profiled.key_averages() if row.device_type == kind]
     rows.sort(key=lambda row: getattr(row, name), reverse=True)
     top = []
@@ -211,7 +219,7 @@ def measure(row: str, network: str, device: str, root: Path, checkout: Path) -> 
     setup = set_up(row, network, device, root)
     place, loading = setup.session.device, setup.session.loading
     warm, number = STEPS[place.type]
-    batches: Iterator[Any] = setup.batches(range(warm + number + 2))
+    batches: Iterator[Any] = setup.batches(range(warm + number + 1))
     ours, theirs = list[tuple[float, float]](), list[tuple[float, float]]()
     release: Callable[[], object] | None = None
     if loading.num_workers == 0:
@@ -224,10 +232,7 @@ def measure(row: str, network: str, device: str, root: Path, checkout: Path) -> 
             with timed(place, theirs):
                 release()
 
-    activity = ProfilerActivity.CUDA if place.type == "cuda" else ProfilerActivity.CPU
-    profiled, counter = profile(activities=[activity]), FlopCounterMode(display=False)
-    after = [profiled, counter] if row == EXAMINED else []
-    recorded = train(setup, watched(batches, place, ours, between, after), root)
+    recorded = train(setup, watched(batches, place, ours, between), root)
     found: dict[str, Any] = summary(ours[warm:], loading.batch_size)
     found["loss"] = recorded[0]["loss"]
     found["waiting"] = median(values[WAIT_SHARE] for values in recorded[warm : warm + number])
@@ -236,9 +241,13 @@ def measure(row: str, network: str, device: str, root: Path, checkout: Path) -> 
         found["release"] = summary(theirs[warm:], loading.batch_size)
         pairs = zip(theirs[warm:], ours[warm:], strict=True)
         found["ratio"] = median(their / our for (their, _), (our, _) in pairs)
-    if after:
-        found |= kernels(profiled, place) | {"flops": counter.get_total_flops()}
+    if row == EXAMINED:
         found["crop"] = list(batch.rgb.shape[-2:])
+        for examine in (operations, kernels):
+            try:
+                found |= examine(lambda: train(setup, iter([OnDevice(batch)]), root), place)
+            except Exception as error:  # the times count without it
+                found[f"{examine.__name__} failed"] = f"{type(error).__name__}: {error}"[:300]
     return found | {"batch": loading.batch_size, "machine": about(setup)}
 
 
