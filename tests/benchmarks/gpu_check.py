@@ -27,6 +27,7 @@ ROWS = {
     "bf16": "bf16-mixed, TF32",
     "bf16_decoder": "bf16-mixed, pixel decoder too",
     "release": "TF32, beside the release",
+    "eager": "TF32, compile=none",
     "tests": "",
     "loader_cache": "TF32, 4 loaders, decoded cache",
     "loader_files": "TF32, 4 loaders, files",

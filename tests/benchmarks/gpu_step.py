@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from statistics import median
@@ -42,6 +43,7 @@ ROWS = {
     "bf16": ("trainer.precision=bf16-mixed",),
     "bf16_decoder": ("trainer.precision=bf16-mixed", "model.pixel_decoder_fp32=false"),
     "release": (),
+    "eager": ("trainer.compile=none",),
     "loader_cache": ("data.num_workers=4",),
     "loader_files": ("data.num_workers=4", "data.cache=null"),
     "recomputed": ("trainer.activation_checkpointing=true",),
@@ -83,7 +85,7 @@ def set_up(row: str, network: str, device: str, root: Path) -> TrainingSetup:
     """CRM as published (batch 14), or a tiny network on a CPU."""
     words = ["+experiment=crm", "tracking=none", f"trainer.accelerator={device}"]
     words += ["scale=paper", f"model=mask2former_{network}", f"dataset.root={root}"]
-    words += [f"trainer.{name}={NEVER}" for name in ("max_steps", "eval_every", "checkpoint_every")]
+    words += [f"trainer.{name}={NEVER}" for name in ("max_steps", "eval_every")]
     words += ["trainer.log_every=1", "data.num_workers=0", f"data.cache={root / 'cache'}"]
     if device == "cpu":
         words += ["model=mask2former_tiny", "recipe.batch_size=2", "scale.crop_hw=[64,96]"]
@@ -143,14 +145,16 @@ def watched(
         between()
 
 
-def train(setup: TrainingSetup, batches: Iterator[Any], folder: Path) -> list[dict[str, float]]:
-    """Train as long as there are batches; what was logged at each step."""
+def train(
+    setup: TrainingSetup, batches: Iterator[Any], folder: Path, **changes: Any
+) -> list[dict[str, float]]:
+    """Train as long as there are batches, too few for a checkpoint; what each step logged."""
     recorded: list[dict[str, float]] = []
     hooks = Hooks()
     hooks.log = lambda step, values: recorded.append(values)  # type: ignore[method-assign]
     trainer = Trainer(
         fabric=setup.fabric,
-        settings=setup.session.trainer,
+        settings=replace(setup.session.trainer, **changes),
         phases=setup.scheme.phases,
         model=setup.model,
         others=setup.others,
@@ -183,14 +187,14 @@ def release_call(checkout: Path, setup: TrainingSetup, batch: Any) -> Callable[[
     )
 
 
-def operations(step: Callable[[], object], _: torch.device) -> dict[str, Any]:
+def operations(step: Callable[..., object], _: torch.device) -> dict[str, Any]:
     """Operations of one step, a multiplication and its addition being two."""
     with FlopCounterMode(display=False) as counter:
-        step()
+        step(compile="none")
     return {"flops": counter.get_total_flops()}
 
 
-def kernels(step: Callable[[], object], device: torch.device) -> dict[str, Any]:
+def kernels(step: Callable[..., object], device: torch.device) -> dict[str, Any]:
     """Kernels and copies of one step; on a CPU operators."""
     on_gpu = device.type == "cuda"
     activity, kind = ProfilerActivity.CPU, DeviceType.CPU
@@ -243,9 +247,13 @@ def measure(row: str, network: str, device: str, root: Path, checkout: Path) -> 
         found["ratio"] = median(their / our for (their, _), (our, _) in pairs)
     if row == EXAMINED:
         found["crop"] = list(batch.rgb.shape[-2:])
+
+        def step(**changes: Any) -> None:
+            train(setup, repeat(OnDevice(batch), 1), root, **changes)
+
         for examine in (operations, kernels):
             try:
-                found |= examine(lambda: train(setup, iter([OnDevice(batch)]), root), place)
+                found |= examine(step, place)
             except Exception as error:  # the times count without it
                 found[f"{examine.__name__} failed"] = f"{type(error).__name__}: {error}"[:300]
     return found | {"batch": loading.batch_size, "machine": about(setup)}
