@@ -6,6 +6,7 @@
 # make docs       checks the pages and their code, builds the site (make site: alone)
 # make mutants    named faults (tests/mutants/*.yaml), each of which a test has to find
 # make bench      benchmarks, as ratios measured in one run
+# make gpu-check  what a GPU does with a training step of the papers' size, in at most six minutes
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -25,7 +26,10 @@ TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt swee
 # Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
 MARKED := README.md,docs/results/findings.md,docs/results/spatial-bias.md
 
-.PHONY: demo test test-all lint docs site results mutants bench
+# gpu-check with BIN=/some/env/bin uses that environment, and installs nothing.
+READY := $(if $(filter command line,$(origin BIN)),,$(VENV)/.ready)
+
+.PHONY: demo test test-all lint docs site results mutants bench gpu-check
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
@@ -66,6 +70,10 @@ mutants: $(VENV)/.ready
 
 bench: $(VENV)/.ready
 	for file in tests/benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m tests.benchmarks.$$(basename $$file .py) || exit 1; done
+
+# RELEASE=/code/CRM_RGBTSeg measures the step of that checkout, too; WORDS="minutes=20 rows=compiled".
+gpu-check: $(READY)
+	$(BIN)/python -m tests.benchmarks.gpu_check $(if $(RELEASE),release=$(RELEASE)) $(WORDS)
 
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -61,7 +61,8 @@ BYTES = [{"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "
 
 # Archived entries of the provenance, and packages; paths are of no use on another machine.
 PROVENANCE = (
-    "started command git_commit git_dirty code python threads platform cpu cpu_usable gpus cuda"
+    "started command git_commit git_dirty code python threads platform cpu cpu_usable gpus cuda "
+    "matmul_precision"
 )
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hydra-core", "optuna")
 

@@ -23,7 +23,14 @@ from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory, place
+from rgbt.engine.device import (
+    autocast,
+    choose_device,
+    fix_threads,
+    keep_memory,
+    place,
+    set_matmul_precision,
+)
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions
@@ -127,6 +134,7 @@ def open_session(
     keep_memory()
     fix_threads(trainer.threads)
     device = device or choose_device(trainer)
+    set_matmul_precision(device, trainer)
     built = spec.build("drawn", "dataset", "transform", "metric", "consistency")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(built["drawn"].weights, "weights"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -30,6 +31,7 @@ from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")
 ONE_RUN = {"-r", "--run"}  # what is done without them
+LAUNCHED = re.compile(r"\+*hydra/launcher=(?!['\"]?basic['\"]?$)")  # also one run is a job
 
 Main = Callable[[DictConfig, list[str]], int | None]
 
@@ -49,10 +51,11 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
             options = {word for word in words if word.startswith("-")}
             if options <= ONE_RUN:
                 words = [word for word in words if word not in options]
-                config, is_search = composed(words)
-                if not is_search:
-                    _check_launcher(words)
+                is_launched = any(map(LAUNCHED.match, words))
+                config, is_search = composed(_of_runs(words) if is_launched else words)
+                if not is_launched and not is_search:
                     return point.checked(config, words)
+                words += MULTIRUN[:is_launched]  # one job is a study of one point
             if not any(word.startswith("hydra/sweeper=") for word in words):
                 first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
                 words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
@@ -96,8 +99,7 @@ class Point:
     def checked(self, config: DictConfig, words: Sequence[str]) -> int | None:
         """Call the command, without the words for Hydra itself."""
         check_keys(config)
-        overrides = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]
-        return self.main(config, overrides)
+        return self.main(config, _of_runs(words))
 
     def __call__(self, config: DictConfig) -> None:
         """Run the point that Hydra has composed; see the class."""
@@ -128,9 +130,6 @@ class Point:
         register_resolvers()
 
 
-def _check_launcher(words: Sequence[str]) -> None:
-    """Refuse a launcher for one run, which Hydra would ignore: the run would be trained here."""
-    for word in words:
-        key, _, name = word.lstrip("+").partition("=")
-        if key == "hydra/launcher" and name.strip("'\"") != "basic":
-            raise InputError(f"{word}: it is for several runs; add -m.")
+def _of_runs(words: Sequence[str]) -> list[str]:
+    """Return the overrides that are not for Hydra itself."""
+    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]

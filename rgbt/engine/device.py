@@ -40,6 +40,18 @@ def choose_device(trainer: TrainerSettings) -> torch.device:
     return torch.device("cpu") if kind == "cpu" else torch.device(kind, 0)
 
 
+def set_matmul_precision(device: torch.device, trainer: TrainerSettings) -> None:
+    """Let CUDA compute float32 products and convolutions in TF32, or not; a CPU is left as it is.
+
+    These are the settings of torch before 2.9, which later versions know: once `fp32_precision` is
+    set, torch.compile and Lightning fail, which read the old ones. `set_float32_matmul_precision`
+    would change the CPU, too.
+    """
+    if device.type == "cuda":
+        in_tf32 = trainer.matmul_precision == "high"
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = in_tf32
+
+
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
     """Return the context of a forward pass on a device."""
     if precision == "32-true":

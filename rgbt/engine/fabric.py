@@ -17,7 +17,8 @@ from rgbt.engine.device import choose_device
 from rgbt.engine.settings import TrainerSettings
 from rgbt.runtime.group import group_from_environment
 
-# Fabric sets itself to INFO when imported, and would repeat the configuration in a line.
+# Fabric sets itself to INFO when imported, and would repeat the configuration in a line, and with
+# trainer.matmul_precision=highest recommend TF32.
 logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
 
 PATIENCE = timedelta(days=7)  # process 0 may wait for the training of another command

@@ -19,6 +19,7 @@ Precision = Literal["32-true", "bf16-mixed"]
 # Settings of the training loop that do not change the result.
 MACHINE_SETTINGS = (
     "accelerator",
+    "matmul_precision",
     "log_every",
     "checkpoint_minutes",
     "checkpoint_evaluations",
@@ -56,6 +57,7 @@ class TrainerSettings:
     threads: ranges.Threads
     selection_split: ranges.Text
     tested: Literal["best", "last"] = "best"
+    matmul_precision: Literal["high", "highest"] = "high"
     averaging: Literal["none", "ema", "last"] = "none"
     ema_decay: ranges.ShareBelowOne = 0.99
     averaged_share: Annotated[float, Interval(gt=0, le=1)] = 0.25

@@ -132,7 +132,7 @@ def packages() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """Return the machine: processor, cores, memory, graphics cards, threads of torch."""
+    """Return the machine: processor, cores, memory, GPUs; threads and precision of torch."""
     # Imported here, so that reading provenance does not cost the start of torch.
     import torch
 
@@ -150,6 +150,7 @@ def machine() -> dict[str, Any]:
         "memory_gib": round(memory / 2**30, 1),
         "gpus": [torch.cuda.get_device_name(index) for index in gpus],
         "cuda": torch.version.cuda,
+        "matmul_precision": torch.get_float32_matmul_precision(),
     }
 
 

@@ -68,6 +68,7 @@ CHANGEABLE = (
     "data",
     "transform.test_short_edge",
     "trainer.accelerator",
+    "trainer.matmul_precision",
     "trainer.threads",
     "trainer.precision",
     CHECKOUT,

@@ -76,7 +76,7 @@ def announce_network(session: Session) -> None:
 
 
 def device_line(session: Session) -> str:
-    """Write the device with its precision: "cpu, 2 threads, 32-true"."""
+    """Write the device with its precision: "cpu, 2 threads, 32-true"; on CUDA also of products."""
     import torch
 
     from rgbt.processes import num_processes
@@ -85,9 +85,12 @@ def device_line(session: Session) -> str:
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
     count = torch.get_num_threads()
     threads = f"{count} thread{'s' * (count > 1)}"
+    precision: str = session.trainer.precision
+    if device.type == "cuda":
+        precision += f", matmul_precision={session.trainer.matmul_precision}"
     if number > 1:
-        return f"{number} x {device.type}{gpu}, {threads} each, {session.trainer.precision}"
-    return f"{device}{gpu}, {threads}, {session.trainer.precision}"
+        return f"{number} x {device.type}{gpu}, {threads} each, {precision}"
+    return f"{device}{gpu}, {threads}, {precision}"
 
 
 def network_line(session: Session) -> str:

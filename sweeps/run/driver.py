@@ -73,7 +73,8 @@ class Driver:
             if self.settings.stop_jobs or not self.executor.is_lasting:
                 self._stop()
             elif self.running:
-                self.view.say("note", f"{len(self.running)} jobs continue without this command.")
+                number = len(self.running)
+                self.view.say("note", f"jobs that continue without this command: {number}.")
             raise
 
     def _step(self) -> bool:
@@ -91,7 +92,11 @@ class Driver:
         was_started = point.is_started
         outcome = point.advance(self.executor, self.runs, self.source.report)
         if point.is_started != was_started:
-            self.view.say("started" if point.is_started else "queued", point.plan.point.label)
+            label = point.plan.point.label
+            if point.is_started:
+                self.view.say("started", f"{label}; see {point.log}")
+            else:
+                self.view.say("queued", label)
         if outcome is not None:
             self.view.ended(point, self.source.record(point.plan, outcome))
         return outcome is not None

@@ -33,7 +33,7 @@ from rgbt.engine.trainer import Hooks, Trainer
 from rgbt.losses import set_criterion
 from rgbt.models.mask2former import head
 from rgbt.runs.specify import specify
-from tests.benchmarks.gpu import write_images
+from tests.benchmarks.gpu_step import write_images
 
 # Operations that make no new memory.
 VIEWS = frozenset(
@@ -148,7 +148,8 @@ def count(network: str, batch_size: int, *, is_fused: bool = False) -> Traffic:
         mock.patch.object(head, "BLOCK_BYTES", 2**40),
         mock.patch.object(torch, "compile", traffic.add_fused),
     ):
-        images = write_images(Path(folder, "images"), 2 * batch_size, (480, 640))
+        images = Path(folder, "images")
+        write_images(images, 2 * batch_size, (480, 640))
         words = ["+experiment=crm", "scale=paper", f"model=mask2former_{network}"]
         words += ["tracking=none", "trainer.accelerator=cpu", f"dataset.root={images}"]
         words += ["data.num_workers=0", f"recipe.batch_size={batch_size}", "scale.pretrained=false"]

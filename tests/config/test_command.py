@@ -109,15 +109,36 @@ def test_point_that_is_read_elsewhere_can_compose_there(
     assert modules == ["omegaconf.grammar_parser", "hydra._internal.defaults_list"]
 
 
+study = command(sweeper="study")(failing)
+
+
 @pytest.mark.parametrize("option", [(), ("-r",), ("--run",)])
-@pytest.mark.parametrize("name", ["submitit_slurm", "submitit_local"])
-def test_launcher_without_several_runs_is_refused(
-    name: str, option: tuple[str, ...], call: Call
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("hydra/launcher=joblib",), "hydra/launcher=joblib: "),
+        (("hydra/launcher=slurm",), "there is no hydra/launcher 'slurm'"),
+        (("hydra/launcher=ray", "seed=0,1", "hydra.sweeper.dry_run=true"), "'seed=0,1'"),
+        (("hydra/launcher=ray", "trainer.max_stps=1"), "'trainer.max_stps' is not a key"),
+        (("hydra/launcher=ray", "hydra.launcher.gpu=1"), "'hydra.launcher.gpu' is not a key"),
+        (("hydra/launcher=ray", "hydra.sweeper.waits=false"), "hydra.sweeper.waits"),
+        (("hydra/launcher=basic", "hydra.sweeper.wait=false"), "hydra.sweeper.wait"),
+    ],
+)
+def test_launcher_of_one_run_is_checked_as_that_of_several(
+    words: tuple[str, ...], said: str, option: tuple[str, ...], call: Call
 ) -> None:
+    code, out, err = call(study, *words, *option)
+    assert (code, out, err.count("rgbt: ")) == (2, "", 1)
+    assert said in err
+
+
+def test_launcher_of_one_run_makes_it_a_study_of_one_point(call: Call, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    code, out, err = call(entry, f"hydra/launcher={name}", *option)
-    said = f"rgbt: hydra/launcher={name}: it is for several runs; add -m.\n"
-    assert (code, out, err) == (2, "", said)
+    words = ("hydra/launcher='submitit_local'", "seed=5", "hydra.sweeper.dry_run=true")
+    code, out, err = call(study, *words, f"runs_dir={tmp_path}", "tracking=none")
+    assert (code, "seed 5" in out) == (0, False), "it is not trained in this process"
+    assert "1 of 1 points would be run" in err
 
 
 def test_basic_launcher_of_one_run_and_one_that_is_only_shown_are_accepted(call: Call) -> None:

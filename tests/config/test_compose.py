@@ -174,3 +174,30 @@ def test_files_and_words_may_choose_for_hydra(own: Path, monkeypatch: pytest.Mon
         assert config == compose(["+experiment=own_stage", "name=sh_source"])
     with pytest.raises(MissingConfigException, match="hydra/launcher/nothing"):
         composed(["hydra/launcher=nothing"])
+
+
+@pytest.mark.parametrize("scale", ["demo", "paper"])
+def test_debug_steps_changes_the_length_of_a_run_alone(scale: str) -> None:
+    words = ["+experiment=crm_kp", f"scale={scale}", "dataset=kp", "dataset.root=/data/KP"]
+    whole, steps = (
+        OmegaConf.to_container(compose([*words, *more]), resolve=True)
+        for more in ((), ("+debug=steps",))
+    )
+    assert isinstance(whole, dict)
+    assert isinstance(steps, dict)
+    changed = {}
+    for group in whole:
+        values = whole[group] if isinstance(whole[group], dict) else {}
+        for key in {*values, *steps[group]} if values else ():
+            if values.get(key) != steps[group].get(key):
+                changed[f"{group}.{key}"] = steps[group].get(key)
+    keys = ("scale.max_steps", "scale.eval_every", "trainer.max_steps", "trainer.eval_every")
+    length = dict.fromkeys(keys, 2)
+    tracking = {key: value for key, value in changed.items() if key.startswith("tracking.")}
+    assert tracking["tracking._target_"] == "rgbt.tracking.tracker.Tracking", "no MLflow"
+    assert changed == {
+        **length,
+        **tracking,
+        "trainer.log_every": 1,
+        "scale.few_scenes": True,
+    }

@@ -1,4 +1,4 @@
-"""Threads, recomputed activations, memory format, compiled forward."""
+"""Threads, precision of products, recomputed activations, memory format, compiled forward."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import restore_optimizer
-from rgbt.engine.device import TrainingForward, fix_threads, place, prepare_training
+from rgbt.engine.device import (
+    TrainingForward,
+    fix_threads,
+    place,
+    prepare_training,
+    set_matmul_precision,
+)
 from rgbt.engine.optimizers import AdamW
 from rgbt.engine.settings import TrainerSettings
 from rgbt.requirements import NetworkRecord
@@ -203,3 +209,33 @@ def test_fix_threads_does_not_depend_on_the_cores(monkeypatch: pytest.MonkeyPatc
         with pytest.raises(InputError, match=rf"trainer.threads=2: unset {name}={ends}"):
             fix_threads(2)
         monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def kept_precision() -> Any:
+    matmul, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = matmul.allow_tf32, cudnn.allow_tf32
+    yield
+    matmul.allow_tf32, cudnn.allow_tf32 = before
+
+
+def in_tf32() -> tuple[bool, ...]:
+    """Products and convolutions of CUDA, then those of the CPU's library (torch 2.9 and later)."""
+    matmul, cudnn, cpu = torch.backends.cuda.matmul, torch.backends.cudnn, torch.backends.mkldnn
+    of_cpu = [getattr(cpu, name, None) for name in ("matmul", "conv")]
+    reduced = [getattr(part, "fp32_precision", "none") != "none" for part in of_cpu]
+    return (matmul.allow_tf32, cudnn.allow_tf32, *reduced)
+
+
+@pytest.mark.usefixtures("kept_precision")
+def test_matmul_precision_changes_cuda_alone() -> None:
+    for device, name, expected in (
+        ("cuda", "highest", (False, False)),
+        ("cpu", "high", (False, False)),
+        ("cuda", "high", (True, True)),
+        ("cpu", "highest", (True, True)),
+    ):
+        set_matmul_precision(torch.device(device, 0), settings(matmul_precision=name))
+        assert in_tf32() == (*expected, False, False)
+        # What torch.compile and Lightning read.
+        assert torch.get_float32_matmul_precision() == ("high" if expected[0] else "highest")

@@ -87,9 +87,11 @@ def test_check_networks_refuses_what_cannot_be_compared() -> None:
     own = tiny()
     on_gpu = replace(own, name="b", trainer=replace(own.trainer, accelerator="cuda"))
     other = replace(own, name="b", trainer=replace(own.trainer, threads=2))
+    exact = replace(own, name="b", trainer=replace(own.trainer, matmul_precision="highest"))
     for networks, key in (
         ([own, own], "networks"),
         ([own, other], "trainer.threads"),
+        ([own, exact], "trainer.matmul_precision"),
         ([own, on_gpu], "trainer.accelerator"),
         (with_onnx([on_gpu]), "trainer.accelerator"),
     ):

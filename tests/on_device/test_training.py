@@ -10,19 +10,17 @@ import pytest
 from rgbt.config.compose import available
 from rgbt.engine.trainer import Trainer
 from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import read_provenance
 from rgbt.runtime.signals import Stopped
 from tests.commands import Call, losses, only_run, short, train
-from tests.on_device.places import NAME, ON_DEVICE, device, exact
+from tests.on_device.places import NAME, ON_DEVICE, device
 from tests.on_device.steps import compare
-
-__all__ = ["exact"]  # a fixture
 
 pytestmark = ON_DEVICE
 ON = (f"trainer.accelerator={NAME or 'cpu'}",)
 SOME = ("crm", "spatialseg", "temporal_con", "sh_adversarial")
 
 
-@pytest.mark.usefixtures("exact")
 @pytest.mark.parametrize(
     "experiment",
     [
@@ -58,6 +56,9 @@ def test_stopped_run_resumes_with_losses_of_straight_run(
         assert train(call, data, stopped, *words)[0] != 0
     code, _, err = train(call, data, stopped, *words)
     assert (code, "resumes at step 2" in err) == (0, True), err
+    processes = read_provenance(only_run(stopped) / "provenance.json")
+    tf32 = {"cuda": "high"}.get(device().type, "highest")
+    assert [process["matmul_precision"] for process in processes] == [tf32, tf32]
     pairs = list(zip(*(losses(only_run(each)) for each in (straight, stopped)), strict=True))
     assert len(pairs) == 4
     for one, other in pairs:

@@ -37,6 +37,7 @@ class Sweep:
         data: a small data set.
         steps: of each run.
         varied: what is swept.
+        options: () for a command of one run.
     """
 
     runs: Path
@@ -44,14 +45,15 @@ class Sweep:
     words: tuple[str, ...] = ()
     steps: int = 10
     varied: str = "seed=0,1,2,3"
+    options: tuple[str, ...] = ("-m",)
     calls: int = 0
 
     def start(self, *more: str) -> BaseProcess:
         """A call of the command, in a process group of its own."""
         length = (f"trainer.max_steps={self.steps}", f"trainer.eval_every={self.steps // 2}")
         own = ("+experiment=grbm", *length, "trainer.checkpoint_minutes=0", self.varied)
-        words = ("rgbt.run", "-m", *words_of(self.data, self.runs, *own), *self.words, *more)
-        return self.call(words)
+        words = (*words_of(self.data, self.runs, *own), *self.words, *more)
+        return self.call(("rgbt.run", *self.options, *words))
 
     def call(self, words: Sequence[str]) -> BaseProcess:
         """Another command about these runs."""
@@ -120,7 +122,8 @@ def steps(folder: Path) -> list[int]:
 def facts(folder: Path) -> dict[str, Any]:
     """All of a finished run that must not depend on where and in how many parts it is trained."""
     result = dict(RunResult(folder).result)
-    del result["seconds_of_last_process"]
+    for name in ("seconds_of_last_process", "name"):  # the name says what is varied
+        del result[name]
     lines = [
         (line["step"], {k: v for k, v in line["values"].items() if k.startswith("loss")})
         for line in logged(folder, "train")

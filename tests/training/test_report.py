@@ -6,10 +6,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 
 from rgbt.run import main
+from rgbt.training.report import device_line
 from tests.commands import Call, Trained, short, words_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,3 +56,17 @@ def test_a_finished_run_is_compared_with_the_present_files(
     code, out, err = call(main, *words)
     assert (code, "mIoU" in out) == (0, True)
     assert "other files" not in err, "a result can be shown without its data"
+
+
+def test_device_line_names_the_precision_of_products_on_cuda(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "H100")
+    trainer = SimpleNamespace(precision="bf16-mixed", matmul_precision="high")
+    lines = []
+    for name in ("cuda", "cpu"):
+        session: Any = SimpleNamespace(device=torch.device(name), trainer=trainer)
+        lines.append(device_line(session))
+    assert lines[0].startswith("cuda (H100), ")
+    assert lines[0].endswith(", bf16-mixed, matmul_precision=high")
+    assert lines[1].endswith(", bf16-mixed")

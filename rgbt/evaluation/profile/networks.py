@@ -18,7 +18,13 @@ from rgbt.config.compose import check_keys, compose
 from rgbt.config.overrides import composing
 from rgbt.config.values import check_value
 from rgbt.data.domains import Domains
-from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
+from rgbt.engine.device import (
+    autocast,
+    choose_device,
+    fix_threads,
+    keep_memory,
+    set_matmul_precision,
+)
 from rgbt.engine.evaluate import class_maps
 from rgbt.engine.settings import TrainerSettings
 from rgbt.exported.onnx_network import exported_network, require_packages
@@ -123,7 +129,7 @@ def check_networks(networks: Sequence[ProfiledNetwork]) -> None:
     names = [network.name for network in networks]
     if len(set(names)) < len(names):
         raise InputError(f"networks: a name occurs twice in {', '.join(names)}.")
-    for key in ("accelerator", "threads"):
+    for key in ("accelerator", "threads", "matmul_precision"):
         values = {str(getattr(network.trainer, key)): network.name for network in networks}
         if len(values) > 1:
             raise InputError(f"trainer.{key}: networks are compared with one value, got {values}.")
@@ -142,6 +148,7 @@ class PreparedNetwork:
         fix_threads(network.trainer.threads)
         self.network = network
         self.device = choose_device(network.trainer)
+        set_matmul_precision(self.device, network.trainer)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive(0, "weights"))
             model: nn.Module = network.model.build()

@@ -101,7 +101,7 @@ def profile(
     Returns:
         a row per network, None where nothing was measured (FLOPs and milliseconds, of every round,
         are of one batch, peak_memory is in bytes), and the setup: kind of the device ("cpu",
-        "cuda" or "mps"), its model, threads, version of PyTorch, settings.
+        "cuda" or "mps"), its model, threads, version and precision of PyTorch, settings.
 
     Raises:
         InputError: names or devices that do not fit, or images that a network cannot predict.
@@ -136,6 +136,7 @@ def profile(
         "kind": device.type,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
+        "matmul_precision": torch.get_float32_matmul_precision(),
         "batch_size": batch_size,
         "rounds": rounds,
         "warmup": warmup,

@@ -40,7 +40,7 @@ def test_ray_of_its_own(straight: Sweep, tmp_path: Path, monkeypatch: pytest.Mon
         pytest.skip("a Ray runs on this machine")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     words = ("hydra/launcher=ray", "hydra.launcher.num_cpus=0.5")
-    sweep = Sweep(tmp_path / "runs", straight.data, words, steps=400, varied="seed=0")
+    sweep = Sweep(tmp_path / "runs", straight.data, words, steps=400, varied="seed=0", options=())
     refused = sweep.start("hydra.sweeper.wait=false")
     assert sweep.end(refused) == 2
     assert "wait=false" in sweep.text

@@ -112,6 +112,25 @@ def test_jobs_go_on_without_a_driver(short: Sweep) -> None:
     assert [resumed_at(short.log_of(seed)) for seed in "01"] == [[], []]
 
 
+def test_one_run_is_a_job_that_outlives_its_command(sweep: Sweep, straight: Sweep) -> None:
+    sweep.varied, sweep.options = "seed=0", ()
+    before = set(queue())
+    process = sweep.start()
+    sweep.until_step(3, "0")
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGTERM)
+    assert sweep.end(process) == 143
+    assert "jobs that continue without this command: 1." in sweep.text
+    (job,) = set(queue()) - before
+    assert re.search(rf"queued +grbm-\w+, job {job}\n", sweep.text), sweep.text
+    said = sweep.finish()  # which follows the same job
+    assert set(queue()) - before == {job}
+    assert re.search(r"finished +grbm-\w+ ", said), said
+    check(sweep, straight, "0")
+    assert resumed_at(sweep.log_of("0")) == []
+    assert f"started on {os.uname().nodename}" in sweep.log_of("0")
+
+
 def test_pruned_trial_saves_and_frees_its_node(short: Sweep) -> None:
     prune_a_trial(short)
     until(lambda: not unfinished(), "the end of the job")
@@ -168,8 +187,10 @@ SMALL_TABLE = (
 )
 
 
-def test_processes_of_submitit(straight: Sweep, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [("-m",), ()])
+def test_processes_of_submitit(straight: Sweep, tmp_path: Path, options: tuple[str, ...]) -> None:
     words = ("hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5")
-    sweep = Sweep(tmp_path / "runs", straight.data, words, steps=4, varied="seed=0")
+    sweep = Sweep(tmp_path / "runs", straight.data, words, 4, "seed=0", options)
     sweep.finish()
     assert steps(sweep.folders()["0"]) == [1, 2, 3, 4]
+    assert "rgbt job: done" in sweep.log_of("0")
