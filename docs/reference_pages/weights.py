@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from reference_pages.markdown import code, page, table
-from rgbt.checkpoints.starts import RECIPES, STARTS, SameStart
 from rgbt.config.compose import available
+from rgbt.runs.starts import RECIPES, STARTS, SameStart
 
 
 def weights_page() -> str:
