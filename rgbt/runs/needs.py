@@ -56,17 +56,16 @@ def lacking(run: RunSpec) -> Lacking:
             given = model.get("checkout")
             where = "FOLDER of the author's code" if given == "???" else f"{given}"
             found["checkout"][f"model.checkout={where} ({what})"] = None
-        if spec.plain["scale"]["pretrained"] and spec.weights is None:
-            for word in _weights(spec):
-                found["weights"][word] = None
+        if files := missing_files(spec):
+            found["weights"][" or ".join(files)] = None
     return {kind: "; ".join(words) for kind, words in found.items() if words}
 
 
-def _weights(run: RunSpec) -> list[str]:
-    """Return the files that a run may start from, as one word, where it starts from any."""
-    starts = starts_of(run.name, run.plain["model"])
-    files = " or ".join(f"{start.file} ({start.origin})" for start in starts)
-    return [files] if files else []
+def missing_files(run: RunSpec) -> list[str]:
+    """Return the published files, one of which the recipe of a run starts from and it does not."""
+    if not run.plain["scale"]["pretrained"] or run.weights is not None:
+        return []
+    return [f"{start.file} ({start.origin})" for start in starts_of(run.name, run.plain["model"])]
 
 
 def _with_upstream(run: RunSpec) -> tuple[RunSpec, ...]:
@@ -144,6 +143,11 @@ def free_bytes(folder: Path) -> int:
     while not known.exists():
         known = known.parent
     return shutil.disk_usage(known).free
+
+
+def in_gb(number: float) -> str:
+    """Write bytes as "1.9 GB", and less than 0.1 GB as "50 MB"."""
+    return f"{number / GB:.1f} GB" if number >= GB / 10 else f"{number / 1e6:.0f} MB"
 
 
 def step_gb(run: RunSpec, batch_size: int) -> float | None:

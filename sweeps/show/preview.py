@@ -11,7 +11,7 @@ from statistics import median
 from rich.console import Group
 
 from rgbt.checks import InputError
-from rgbt.runs.needs import GB, checkpoint_bytes, free_bytes
+from rgbt.runs.needs import checkpoint_bytes, free_bytes, in_gb
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.starts import SIZES
 from rgbt.tables import ABSENT, TextTable
@@ -71,11 +71,6 @@ def pending_bytes(run: RunSpec | None) -> dict[str, int]:
     except InputError:
         return {}
     return found
-
-
-def in_gb(number: float) -> str:
-    """Write bytes as "1.9 GB", and less than 0.1 GB as "50 MB"."""
-    return f"{number / GB:.1f} GB" if number >= GB / 10 else f"{number / 1e6:.0f} MB"
 
 
 def time_and_disk(
