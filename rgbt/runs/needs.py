@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.files.yaml_files import read_yaml
-from rgbt.geometry.padding import padded_hw
-from rgbt.requirements import SchemeRecord, record_of
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.source_code import checkout_code
 from rgbt.runs.starts import sizes_of, starts_of
@@ -97,6 +95,8 @@ def checkpoint_bytes(run: RunSpec) -> int | None:
 def _checkpoint_bytes(run: RunSpec, is_averaged: bool) -> int:
     import torch
 
+    from rgbt.requirements import SchemeRecord, record_of
+
     run.use(("model", "loss", "masker", "scheme", "optimizer", "domains"))
     with torch.device("meta"):
         network = run.model.build()
@@ -155,6 +155,8 @@ def step_gb(run: RunSpec, batch_size: int) -> float | None:
 
     Counted were `MEMORY`: networks with the training step, and activations grow with the pixels.
     """
+    from rgbt.geometry.padding import padded_hw
+
     model, crop_hw = run.plain["model"], run.plain["scale"]["crop_hw"]
     scheme = run.plain["scheme"]["_target_"].rpartition(".")[2]
     for row in MEMORY if crop_hw is not None else ():

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from rgbt.checks import InputError, without_controls
-from rgbt.processes import num_processes
-from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 from rgbt.runs.folder import (
     GROUP,
     Description,
@@ -68,6 +66,8 @@ def _memory_lines(setup: TrainingSetup) -> list[tuple[str, str]]:
     import torch
 
     from rgbt.engine.memory import training_advice
+    from rgbt.processes import num_processes
+    from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 
     session = setup.session
     share = session.loading.batch_size // num_processes()
@@ -114,6 +114,8 @@ def announce_network(session: Session) -> None:
 def device_line(session: Session) -> str:
     """Write the device with its precision: "cpu, 2 threads, 32-true"."""
     import torch
+
+    from rgbt.processes import num_processes
 
     device, number = session.device, num_processes()
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
