@@ -24,7 +24,13 @@ from sweeps.plan.request import TAG, seed_of
 from sweeps.point import Outcome, Point
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
-from sweeps.show.preview import WIDTH, need_lines, seconds_a_step, time_and_disk
+from sweeps.show.preview import (
+    WIDTH,
+    need_lines,
+    seconds_a_step,
+    short_label,
+    time_and_disk,
+)
 from sweeps.space import signature
 
 # Estimated duration of a run as long as no run of its network has finished: that of an arm at
@@ -181,8 +187,8 @@ class Queue:
         rows: list[tuple[str, ...]] = []
         for point in sorted(missing.values(), key=self.rank, reverse=True):
             first, *others = names[point.overrides]
-            table = f"{first} and {len(others)} more" if others else first
+            table = f"{first} +{len(others)}" if others else first
             needs = time_and_disk(point, self.planner, step_s)
-            rows.append((point.label, table, f"{self._worth[point.overrides]:.2f}", *needs))
+            rows.append((short_label(point), table, f"{self._worth[point.overrides]:.2f}", *needs))
         header = ("run", "table", "claims", "time", "disk", "missing")
         return TextTable("Missing runs in their order", header, tuple(rows))

@@ -26,6 +26,7 @@ STATES: tuple[State, ...] = ("finished", "running", "failed", "missing", "waitin
 LEFT: tuple[State, ...] = ("failed", "missing", "waiting")  # what a call runs, once it can
 TRAINED = "trained, not evaluated for all columns"
 WIDTH = 120  # columns of a preview in a file
+LABEL = 40  # of them for a label, which stays one line
 EFFECTS = {
     "data": "data set: required",
     "checkout": "code of its author: required",
@@ -71,6 +72,13 @@ def pending_bytes(run: RunSpec | None) -> dict[str, int]:
     except InputError:
         return {}
     return found
+
+
+def short_label(point: Point) -> str:
+    """Return the label of a row, cut to one line, with its seed."""
+    row, _, seed = point.label.rpartition(" ")
+    cut = row if len(row) <= LABEL else f"{row[: LABEL - 1]}…"
+    return f"{cut} {seed}".strip()
 
 
 def time_and_disk(
@@ -161,5 +169,5 @@ def _preview_row(
         time, disk, missing = ABSENT if known is None else duration(known), ABSENT, ""
     reason = outcome.reason if outcome.state == "failed" else missing
     keys = " ".join(outcome.keys) or ABSENT
-    label = outcome.point.label
-    return (label, outcome.state, time, disk, keys, TRAINED if outcome.is_trained else reason)
+    note = TRAINED if outcome.is_trained else reason
+    return (short_label(outcome.point), outcome.state, time, disk, keys, note)

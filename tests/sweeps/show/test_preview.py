@@ -73,12 +73,13 @@ def test_every_row_of_all_tables_says_time_disk_and_what_is_missing(
     lines = out.splitlines()
     assert (code, max(map(len, lines))) == (0, 120)
     assert list(tmp_path.iterdir()) == [], "nothing is written"
-    rows = [line for line in lines if " seed=0 " in line]
+    rows = [line for line in lines if "seed=0 " in line]
     requests = [make_request(name, "paper") for name in table_names(PUBLISHED, STUDIES)]
     assert len(table_names(PUBLISHED)) == 25
     wanted = {point.overrides for request in requests for point in request.points()}
     assert len(rows) == len(wanted), "rows of one run are one"
     for row in rows:
+        assert not row.startswith("  seed=0"), "a label is one line"
         # A table, claims, no time before the first run; gigabytes; then what is missing.
         assert re.search(r"\d\.\d\d +- +(\d+\.\d GB|\d+ MB|-) ", row), row
         is_known = re.search(r"GB|MB", row) or "checkout" in row
