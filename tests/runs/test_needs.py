@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from rgbt.runs.needs import checkpoint_bytes, free_bytes, in_gb, lacking, step_gb
+from rgbt.runs.needs import MEMORY, checkpoint_bytes, free_bytes, in_gb, lacking, step_gb
 from sweeps.plan.planner import specify_run
+from tests.benchmarks import bench_memory
 from tests.commands import DAYS_AND_NIGHTS, Trained, short, words_of
 
+ROOT = Path(__file__).resolve().parents[2]
 PAPER = ("+experiment=crm", "scale=paper")
 
 
@@ -74,6 +77,29 @@ def test_memory_of_a_step_grows_with_images_and_pixels() -> None:
     assert step_gb(less, 14) == pytest.approx((2.28 + 13 * 0.53) * gib)
     for words in (PAPER[:1], ("+experiment=baseline", "scale=paper")):
         assert step_gb(specify_run(words, checked=False), 1) is None, "it was not counted"
+
+
+def test_page_has_the_counted_memory() -> None:
+    page = (ROOT / "docs" / "how-to" / "fit-into-memory.md").read_text()
+    rows = re.findall(r"^\|(.*\d+x\d+) \|(.*)\|(.*)\|(.*)\|$", page, re.MULTILINE)
+    assert len(rows) == len(MEMORY)
+    for (name, one, paper, recomputed), row in zip(rows, MEMORY, strict=True):
+        assert "{}x{}".format(*row["crop"]) in name
+        batch, _, gib = paper.partition(": ")
+        further = int(batch) - 1
+        less = row["recomputed"][0] + further * row["recomputed"][1]
+        expected = (row["first"], row["first"] + further * row["further"], less)
+        assert (float(one), float(gib), float(recomputed)) == pytest.approx(expected, abs=0.06)
+
+
+@pytest.mark.slow
+def test_memory_is_that_of_the_benchmark() -> None:
+    """The network that is counted in a few seconds stands for all: CMX has the same loss."""
+    case = bench_memory.Case("mfnet")
+    (row,) = [row for row in MEMORY if row["model"] == "mfnet"]
+    found = [bench_memory.counted(case, n, bf16=False, recomputed=False) for n in (1, 2)]
+    one, two = ((4 * count["weights"] + count["activations"]) / 1024 for count in found)
+    assert (one, two - one) == pytest.approx((row["first"], row["further"]), abs=0.01)
 
 
 def test_room_on_the_disk(tmp_path: Path) -> None:

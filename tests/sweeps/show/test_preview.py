@@ -49,18 +49,17 @@ def test_shared_upstream_runs_count_once(
 def test_a_table_that_lacks_all_is_planned(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """RTFNet has 152 layers in this table; the rows of other networks are shown too."""
+    """Rows of Temporal have ResNets of two sizes, and each its file."""
     monkeypatch.chdir(tmp_path)
-    words = (
-        "table=crm/table2b",
-        "rows=1,2,RTFNet,5",
-        "scale=paper",
-        "dry_run=true",
-        "tracking=none",
-    )
+    words = ("table=temporal/table5", "rows=1", "scale=paper", "dry_run=true", "tracking=none")
     code, out, err = call(entry, *words)
     assert (code, err) == (0, "")
     assert list(tmp_path.iterdir()) == [], "nothing is written"
+    # 185.24 M parameters: two copies of the weights, one momentum, of 4 bytes each.
+    (row,) = [line.split() for line in out.splitlines() if "seed=0" in line]
+    assert row[3:] == ["missing", "-", "2.2", "GB", "-", "data,", "weights"]
+    assert "resnet50-0676ba61.pth" in out
+    assert "resnet152" not in out
     assert "Time with workers=1: known after the first run." in out
 
 
