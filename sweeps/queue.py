@@ -27,6 +27,7 @@ from sweeps.run.run_store import RunStore
 from sweeps.show.preview import (
     WIDTH,
     need_lines,
+    print_needs,
     seconds_a_step,
     short_label,
     time_and_disk,
@@ -67,18 +68,24 @@ class Queue:
             self._points += points
             self._owners += [place] * len(points)
 
-    def point_list(self, *, is_ranked: bool) -> PointList:
+    def point_list(self, workers: int, *, is_ranked: bool) -> PointList:
         """Return the points of all tables as one study, `is_ranked` by what they decide."""
+
+        def announce(outcomes: Sequence[Outcome]) -> None:
+            print_needs(outcomes, self.planner, self.runs.runs_dir, workers)
+
         request, *_ = requests = [table.judged.request for table in self.tables]
         points = tuple(self._points)
         if not is_ranked:
             title = f"{request.name} scale={request.scale}"
             more = self.tables[0] if request.until_decided else None
-            return PointList(request.study, title, points, self.runs, self.planner, more)
+            own = (request.study, title, points, self.runs, self.planner)
+            return PointList(*own, more, announce=announce)
         title = f"tables {request.scale}"
         identity = signature([request.study for request in requests])
         study = f"{title} {identity[:6]}"  # a driver of other tables does not run these
-        return PointList(study, title, points, self.runs, self.planner, self.more, self.rank)
+        own = (study, title, points, self.runs, self.planner)
+        return PointList(*own, self.more, self.rank, announce)
 
     def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
         """Return the next seeds of open claims, given all points in their order.

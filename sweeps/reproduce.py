@@ -144,7 +144,8 @@ def run_tables(
     if is_several(options):
         runs.archive = options.archive
     queue = Queue(tables, runs, planner, is_dry=settings.dry_run)
-    points = queue.point_list(is_ranked=is_several(options))
+    workers = settings.workers or 1
+    points = queue.point_list(workers, is_ranked=is_several(options))
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0
@@ -156,11 +157,11 @@ def run_tables(
     if outcomes is None:
         return 0
     if is_several(options):
-        return queue.report(outcomes, settings.workers or 1)
+        return queue.report(outcomes, workers)
     (table,) = tables
     request = table.judged.request
     if settings.dry_run:
-        print_preview(request, outcomes, planner, settings.workers or 1, runs.runs_dir)
+        print_preview(request, outcomes, planner, workers, runs.runs_dir)
         return 0
     judged = replace(
         table.judged,

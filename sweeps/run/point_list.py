@@ -40,6 +40,7 @@ class PointList:
         more: further points, from the outcomes until now; requested when no point is waiting.
         rank: which waiting point is the next: the one of the highest rank, and `more` is requested
             after each end; None: they are run in their order.
+        announce: says what the runs need, from all outcomes, before the first one starts.
     """
 
     study: str
@@ -49,6 +50,7 @@ class PointList:
     planner: Planner
     more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
     rank: Callable[[Point], float] | None = None
+    announce: Callable[[Sequence[Outcome]], None] | None = None
 
 
 class ListSource:
@@ -235,6 +237,8 @@ def run_points(
         for index, reason in source.errors.items():  # before hours of training
             label = points.points[index].label
             info(f"{label}: {reason.removeprefix(f'{label}: ')}")
+        if points.announce is not None:
+            points.announce(source.outcomes())
         drive(ProgressView(points.title), source, points.runs, settings)
         return source.outcomes()
 

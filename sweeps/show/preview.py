@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from rich.console import Group
+from rich.console import Console, Group
 
 from rgbt.checks import InputError
 from rgbt.runs.needs import checkpoint_bytes, free_bytes, in_gb
@@ -130,6 +131,14 @@ def need_lines(
     rows = [(EFFECTS[kind], what, str(number)) for (kind, what), number in missing.items()]
     table = TextTable("Missing", ("what", "name", "runs"), tuple(sorted(rows)))
     return Group(*parts, rich_table(table))
+
+
+def print_needs(
+    outcomes: Sequence[Outcome], planner: Planner, runs_dir: Path, workers: int
+) -> None:
+    """Print `need_lines` on stderr, where the progress of the runs follows."""
+    width = None if sys.stderr.isatty() else WIDTH
+    Console(stderr=True, width=width).print(need_lines(outcomes, planner, runs_dir, workers))
 
 
 def _time(seconds: Sequence[float | None], workers: int) -> str:
