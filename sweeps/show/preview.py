@@ -28,11 +28,7 @@ LEFT: tuple[State, ...] = ("failed", "missing", "waiting")  # what a call runs, 
 TRAINED = "trained, not evaluated for all columns"
 WIDTH = 120  # columns of a preview in a file
 LABEL = 40  # of them for a label, which stays one line
-EFFECTS = {
-    "data": "data set: required",
-    "checkout": "code of its author: required",
-    "weights": "ImageNet weights: random values otherwise",
-}
+MISSING = "Missing: without weights, a row starts from random values; without data or checkout, not at all"
 
 
 def seconds_a_step(outcomes: Sequence[Outcome], planner: Planner) -> dict[str, float]:
@@ -128,8 +124,8 @@ def need_lines(
     parts = [plain_text("\n".join(lines))] if lines else []
     if not missing:
         return Group(*parts)
-    rows = [(EFFECTS[kind], what, str(number)) for (kind, what), number in missing.items()]
-    table = TextTable("Missing", ("what", "name", "runs"), tuple(sorted(rows)))
+    rows = [(kind, what, str(number)) for (kind, what), number in missing.items()]
+    table = TextTable(MISSING, ("kind", "what", "runs"), tuple(sorted(rows)))
     return Group(*parts, rich_table(table))
 
 

@@ -14,7 +14,7 @@ from sweeps.plan.table import PUBLISHED, STUDIES, table_names
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import entry
 from sweeps.show import preview
-from sweeps.show.preview import need_lines
+from sweeps.show.preview import MISSING, need_lines
 from tests.commands import Call
 
 
@@ -85,7 +85,7 @@ def test_every_row_of_all_tables_says_time_disk_and_what_is_missing(
         assert is_known, row
     assert "Time with workers=1: known after the first run." in out
     assert re.search(r"Disk: \d+\.\d GB of checkpoints", out)
-    named = out.rpartition("Missing")[2]
+    named = out.partition(MISSING)[2]
     for file in ("swin_small_patch4", "swin_tiny_patch4", "swin_base_patch4", "mit_b2", "mit_b4"):
         assert file in named
     for name in ("mfnet", "kp", "pst900", "freiburg"):
