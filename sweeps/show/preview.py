@@ -28,7 +28,7 @@ LEFT: tuple[State, ...] = ("failed", "missing", "waiting")  # what a call runs, 
 TRAINED = "trained, not evaluated for all columns"
 WIDTH = 120  # columns of a preview in a file
 LABEL = 40  # of them for a label, which stays one line
-MISSING = "Missing: without weights, a row starts from random values; without data or checkout, not at all"
+MISSING = "Missing: without weights, a row starts at random; without data or checkout, not at all"
 
 
 def seconds_a_step(outcomes: Sequence[Outcome], planner: Planner) -> dict[str, float]:
