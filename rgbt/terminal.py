@@ -32,9 +32,13 @@ def warn(sentence: str) -> None:
     info(f"warning: {sentence}")
 
 
-def print_rich(renderable: RenderableType) -> None:
-    """Print results to stdout; no line of text and no number is cut."""
-    Console(width=None if sys.stdout.isatty() else WIDTH).print(renderable, soft_wrap=True)
+def print_rich(renderable: RenderableType, *, width: int = WIDTH) -> None:
+    """Print results to stdout; no line of text and no number is cut.
+
+    `width` is that of a file. With another than `WIDTH`, lines of text are broken there too.
+    """
+    console = Console(width=None if sys.stdout.isatty() else width)
+    console.print(renderable, soft_wrap=width == WIDTH)
 
 
 def plain_text(text: str, style: str = "") -> Text:

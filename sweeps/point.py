@@ -14,7 +14,7 @@ from rgbt.runs.result import RunResult
 from sweeps.plan.measurement import Words
 
 Value = str | int | float | bool | None
-State = Literal["finished", "failed", "pruned", "running", "waiting"]
+State = Literal["finished", "failed", "pruned", "running", "waiting", "missing"]
 # States of points that a command runs.
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 
@@ -71,8 +71,9 @@ class Outcome:
     """Says how a point stands, with its finished runs.
 
     Attributes:
-        state: "running" may be by another driver; "pruned" is only a trial of a search.
-        reason: why it failed or was pruned, in a sentence, or "".
+        state: "running" may be by another driver; "pruned" is only a trial of a search; "missing":
+            it lacks a data set or the code of another author.
+        reason: why it failed or was pruned, or what it lacks, in a sentence, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
         missing: words of a measurement that a finished run has not -> why.

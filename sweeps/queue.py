@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
+from rich.console import Group
+
 from analysis.archive import add
 from rgbt.runs.provenance import machine, machine_name
 from rgbt.tables import TextTable
@@ -22,6 +24,14 @@ from sweeps.plan.request import TAG, seed_of
 from sweeps.point import Outcome, Point
 from sweeps.run.point_list import PointList
 from sweeps.run.run_store import RunStore
+from sweeps.show.preview import (
+    WIDTH,
+    need_lines,
+    print_needs,
+    seconds_a_step,
+    short_label,
+    time_and_disk,
+)
 from sweeps.space import signature
 
 # Estimated duration of a run as long as no run of its network has finished: that of an arm at
@@ -45,6 +55,8 @@ class Queue:
 
     def __post_init__(self) -> None:
         self._machine = machine_name(machine())
+        # A plan orders what cannot start yet as if it could.
+        self._wanted = ("waiting", "missing") if self.is_dry else ("waiting",)
         self._claims = self._decided = 0  # of claims about scores, see `more`
         self._worth: dict[tuple[str, ...], float] = defaultdict(float)  # by overrides of a run
         self._seconds: dict[str, list[float]] = defaultdict(list)  # of finished runs by network
@@ -56,18 +68,24 @@ class Queue:
             self._points += points
             self._owners += [place] * len(points)
 
-    def point_list(self, *, is_ranked: bool) -> PointList:
+    def point_list(self, workers: int, *, is_ranked: bool) -> PointList:
         """Return the points of all tables as one study, `is_ranked` by what they decide."""
+
+        def announce(outcomes: Sequence[Outcome]) -> None:
+            print_needs(outcomes, self.planner, self.runs.runs_dir, workers)
+
         request, *_ = requests = [table.judged.request for table in self.tables]
         points = tuple(self._points)
         if not is_ranked:
             title = f"{request.name} scale={request.scale}"
             more = self.tables[0] if request.until_decided else None
-            return PointList(request.study, title, points, self.runs, self.planner, more)
+            own = (request.study, title, points, self.runs, self.planner)
+            return PointList(*own, more, announce=announce)
         title = f"tables {request.scale}"
         identity = signature([request.study for request in requests])
         study = f"{title} {identity[:6]}"  # a driver of other tables does not run these
-        return PointList(study, title, points, self.runs, self.planner, self.more, self.rank)
+        own = (study, title, points, self.runs, self.planner)
+        return PointList(*own, self.more, self.rank, announce)
 
     def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
         """Return the next seeds of open claims, given all points in their order.
@@ -83,7 +101,7 @@ class Queue:
             pairs = zip(outcomes, owners, strict=True)
             own = [outcome for outcome, owner in pairs if owner == place]
             new = table(own) if table.judged.request.until_decided else []
-            waiting = [outcome.point for outcome in own if outcome.state == "waiting"]
+            waiting = [outcome.point for outcome in own if outcome.state in self._wanted]
             self._count(table, own, [*waiting, *new])
             added += new
             self._owners += [place] * len(new)
@@ -140,9 +158,10 @@ class Queue:
         return median(self._seconds.get(self._network(point)) or [DEFAULT_S])
 
     def _network(self, point: Point) -> str:
-        return str(self.planner.specify((*self.planner.base, *point.overrides)).model.target)
+        run = self.planner.composed(point)
+        return "" if run is None else str(run.plain["model"]["_target_"])
 
-    def report(self, outcomes: Sequence[Outcome]) -> int:
+    def report(self, outcomes: Sequence[Outcome], workers: int) -> int:
         """Print how several tables stand; in a dry run first their missing runs, in their order.
 
         Returns:
@@ -150,12 +169,14 @@ class Queue:
         """
         self.more(outcomes)
         if self.is_dry:
-            print_rich(rich_table(self._missing_runs(outcomes)))
+            needs = need_lines(outcomes, self.planner, self.runs.runs_dir, workers)
+            print_rich(Group(rich_table(self._missing_runs(outcomes)), needs), width=WIDTH)
         states = Counter(outcome.state for outcome in outcomes)
+        missing = f", {states['missing']} missing something" if states["missing"] else ""
         scale = self.tables[0].judged.request.scale
         info(
             f"{states['finished']} of {len(outcomes)} runs are finished, {states['failed']} "
-            f"failed; {self._decided} of {self._claims} claims are decided: "
+            f"failed{missing}; {self._decided} of {self._claims} claims are decided: "
             f"rgbt claims scale={scale}"
         )
         return int(states["failed"] > 0)
@@ -164,17 +185,17 @@ class Queue:
         names: dict[tuple[str, ...], dict[str, None]] = {}  # of tables, by overrides of a run
         missing: dict[tuple[str, ...], Point] = {}
         for outcome, owner in zip(outcomes, self._owners, strict=False):
-            if outcome.state == "waiting":
+            if outcome.state in (*self._wanted, "failed"):
                 point = outcome.point
                 missing.setdefault(point.overrides, point)
                 name = self.tables[owner].judged.request.name
                 names.setdefault(point.overrides, {})[name] = None
+        step_s = seconds_a_step(outcomes, self.planner)
         rows: list[tuple[str, ...]] = []
-        total = 0.0
         for point in sorted(missing.values(), key=self.rank, reverse=True):
-            minutes, worth = self._estimated_s(point) / 60, self._worth[point.overrides]
-            total += minutes
-            name = ", ".join(names[point.overrides])
-            rows.append((point.label, name, f"{worth:.2f}", f"{minutes:.1f}", f"{total:.0f}"))
-        header = ("run", "table", "claims", "minutes", "total")
+            first, *others = names[point.overrides]
+            table = f"{first} +{len(others)}" if others else first
+            needs = time_and_disk(point, self.planner, step_s)
+            rows.append((short_label(point), table, f"{self._worth[point.overrides]:.2f}", *needs))
+        header = ("run", "table", "claims", "time", "disk", "missing")
         return TextTable("Missing runs in their order", header, tuple(rows))

@@ -5,6 +5,7 @@ Rerun the command to resume. hydra/launcher=submitit_slurm or ray runs it on a c
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,6 +93,8 @@ def main(options: Options, overrides: list[str]) -> int:
     from sweeps.plan.request import check_overrides
     from sweeps.run.run_store import open_run_store
 
+    # Composed configurations live: to look for circles among them took a tenth of a plan.
+    gc.set_threshold(100_000)
     of_hydra = [word for word in overrides if word.startswith(HYDRA)]
     others = [word for word in overrides if word not in of_hydra]
     for word in others:  # of a row they would have no effect
@@ -129,7 +132,8 @@ def run_tables(
     from sweeps.run.point_list import commands_line, preview_points, run_points
     from sweeps.score.efficiency import network_sizes
     from sweeps.score.external import evaluate_external
-    from sweeps.show.publish import print_preview, publish_table
+    from sweeps.show.preview import print_preview
+    from sweeps.show.publish import publish_table
 
     tables = []
     for request in requested_tables(options, words, planner):
@@ -140,7 +144,8 @@ def run_tables(
     if is_several(options):
         runs.archive = options.archive
     queue = Queue(tables, runs, planner, is_dry=settings.dry_run)
-    points = queue.point_list(is_ranked=is_several(options))
+    workers = settings.workers or 1
+    points = queue.point_list(workers, is_ranked=is_several(options))
     if settings.commands is not None:
         info(commands_line(points, settings))
         return 0
@@ -152,11 +157,11 @@ def run_tables(
     if outcomes is None:
         return 0
     if is_several(options):
-        return queue.report(outcomes)
+        return queue.report(outcomes, workers)
     (table,) = tables
     request = table.judged.request
     if settings.dry_run:
-        print_preview(request, outcomes, settings.workers or 1)
+        print_preview(request, outcomes, planner, workers, runs.runs_dir)
         return 0
     judged = replace(
         table.judged,
@@ -189,7 +194,7 @@ def requested_tables(
     for name in names:
         try:
             request = _request(options, name, words, planner)
-            _check_trainable(request, planner)
+            _check_trainable(request, planner, is_dry=options.dry_run)
         except InputError as error:
             info(f"{name} is left out: {error}")
         else:
@@ -217,14 +222,19 @@ def _request(options: Options, name: str, words: Sequence[str], planner: Planner
     return replace(request, seeds=seeds, until_decided=is_adding, digests=digests)
 
 
-def _check_trainable(request: TableRequest, planner: Planner) -> None:
-    """Refuse a table of which no row can be trained, with the reason of the first row."""
+def _check_trainable(request: TableRequest, planner: Planner, *, is_dry: bool) -> None:
+    """Refuse a table of which no row can be trained, with the reason of the first row.
+
+    If it `is_dry`, a table whose rows lack something is shown with that.
+    """
     reason = InputError("none of its rows is trained.")
     for point in reversed(request.points()):
         try:
             planner.plan(point)
         except InputError as error:
             reason = error
+            if is_dry and planner.lacking(point):
+                return
         else:
             return
     raise reason

@@ -138,7 +138,7 @@ def _run_grid(points: PointList, settings: SweepSettings) -> None:
         guess = "" if seconds is None else f", about {duration(seconds)}"
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         return
-    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
+    failed = [outcome for outcome in outcomes if outcome.state in ("failed", "missing")]
     if failed:
         raise RunError(
             f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "

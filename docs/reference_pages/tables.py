@@ -43,7 +43,10 @@ def _runnable(spec: dict[str, Any]) -> str:
 
 def _section(name: str, spec: dict[str, Any]) -> list[str]:
     columns = [each["name"] for each in spec["columns"]]
-    remarks = [f"- {' '.join(each.split())}" for each in spec.get("remarks", [])]
+    remarks = []
+    for remark in spec.get("remarks", []):
+        for text in [remark] if isinstance(remark, str) else remark.values():
+            remarks.append(f"- {' '.join(text.split())}")
     rows = [
         [
             row["label"],

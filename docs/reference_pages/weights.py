@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from reference_pages.markdown import code, page, table
-from rgbt.checkpoints.starts import RECIPES, STARTS, SameStart
 from rgbt.config.compose import available
+from rgbt.runs.starts import RECIPES, STARTS
 
 
 def weights_page() -> str:
     """Recipes by the file that they start from, and every file with its digest."""
+    rows = []
+    for recipe in RECIPES:
+        names = ", ".join(map(code, recipe.named(available("experiment"))))
+        for model, files in recipe.by_network().items() or [(f"{recipe.model}*", [])]:
+            text = " or ".join(map(code, files)) or "none: random values"
+            rows.append([names, code(model), text, recipe.source if names else ""])
+            names = ""  # the next network is of the same recipe
     return page(
         "# Published weights",
         "A recipe is an experiment at `scale=paper`. This page names the public file that each one "
@@ -17,7 +24,9 @@ def weights_page() -> str:
         "dataset.root=/data/MFNet \\\n  pretrained=swin_small_patch4_window7_224.pth\n```",
         "`pretrained` initialises the network of the run, or that of its first upstream run.",
         "## Files by recipe",
-        table(["Recipes", "Networks", "Files", "Source"], [_recipe(recipe) for recipe in RECIPES]),
+        "`rgbt run` and `rgbt reproduce ... dry_run=true` name the file that a run lacks. Of "
+        "several files, the first is the one to get.",
+        table(["Recipes", "`model=`", "Files", "Source"], rows),
         "## Files",
         "A digest is the beginning of the SHA-256, where it is known. `rgbt weights inspect FILE` "
         "prints the SHA-256 of your file, the recipes of a published file, and a remark where a "
@@ -46,9 +55,3 @@ def weights_page() -> str:
         "- Files in the names of Hugging Face Transformers (`microsoft/swin-*`, `nvidia/mit-*`) "
         "and of MMSegmentation are not read. Take the file of the table.",
     )
-
-
-def _recipe(recipe: SameStart) -> list[str]:
-    names = recipe.named(available("experiment"))
-    files = ", ".join(map(code, recipe.files)) or "none: random values"
-    return [", ".join(map(code, names)), code(f"{recipe.model}*"), files, recipe.source]

@@ -39,6 +39,7 @@ from rgbt.requirements import (
     check_requirements,
     record_of,
 )
+from rgbt.runs.needs import missing_files
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
 from rgbt.types import Sample
@@ -269,9 +270,11 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
     spec, name = session.spec, session.dataset.name
     expected = spec.scale.pretrained and record_of(session.model, NetworkRecord).pretrained_parts
     if expected and session.weights is None:
+        files = " or ".join(missing_files(spec)) or "a file"
         info(
             "the published recipe starts from ImageNet weights, but this run starts from random "
-            "weights. Name a file with pretrained=..., or expect lower scores than published."
+            f"weights. Get {files}, and name it with pretrained=..., or expect lower scores than "
+            "published."
         )
     meant = spec.recipe.dataset
     if spec.scale.name == "paper" and meant != name:

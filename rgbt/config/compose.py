@@ -34,6 +34,8 @@ from rgbt.checks import InputError, nearest
 SEARCH_PATH = "hydra.searchpath"  # names the folders of a user's own files for one command
 OWN_FOLDERS = "RGBT_CONF"  # names them for every composition, with commas (conf/config.yaml)
 
+DEFAULT_SCALE = "demo"  # of a run without ``scale=...``
+
 # Scale -> scale whose files it has, where a choice by scale does not name it.
 SAME_FILES = {"bench": "demo"}
 

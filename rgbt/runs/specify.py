@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS
 from rgbt.config.compose import (
+    DEFAULT_SCALE,
     SEARCH_PATH,
     available,
     compose,
@@ -241,7 +242,8 @@ def _upstream_config(
     reference: Reference, scale: str, values: bytes, with_network: bool, own: str
 ) -> tuple[DictConfig, dict[str, Any]]:
     del own  # of `compose`
-    upstream = compose([f"+experiment={reference.experiment}", f"scale={scale}"])
+    chosen = () if scale == DEFAULT_SCALE else (f"scale={scale}",)
+    upstream = compose([f"+experiment={reference.experiment}", *chosen])
     if with_network:
         own_settings = RUN_SETTINGS["model"]
         upstream.model = {setting: upstream.model._get_node(setting) for setting in own_settings}

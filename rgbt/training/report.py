@@ -22,10 +22,11 @@ from rgbt.runs.folder import (
     read_tables,
 )
 from rgbt.runs.naming import describe
+from rgbt.runs.needs import GB, SPARE_GB, checkpoint_bytes, free_bytes, in_gb, step_gb
 from rgbt.runs.provenance import warn_of_result
 from rgbt.runs.run_spec import RunSpec
 from rgbt.tables import ResultTables, percent, subset_mious
-from rgbt.terminal import info, path_lines, print_rich, result_view
+from rgbt.terminal import info, path_lines, print_rich, result_view, warn
 from rgbt.tracking.tracker import Tracking
 
 if TYPE_CHECKING:  # they import torch, which takes seconds
@@ -36,9 +37,10 @@ if TYPE_CHECKING:  # they import torch, which takes seconds
 
 
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
-    """Print device, network, images, their sizes, steps and run folder of a training.
+    """Print device, network, images, their sizes, steps, disk and run folder of a training.
 
-    With rare class sampling, also the probability of each class.
+    With rare class sampling, also the probability of each class; on CUDA, the memory of a step
+    where it was counted. It warns where disk or memory are too small.
     """
     session, trainer = setup.session, setup.session.trainer
     trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
@@ -52,9 +54,43 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         *(("labels", text) for text in setup.absent),
         *([("drawn", setup.rare.shares())] if setup.rare else []),
         ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
+        *_memory_lines(setup),
+        *_disk_lines(session.spec, folder),
         ("folder", str(folder)),
     ]
     _write(name, *(f"  {line}" for line in path_lines(lines).plain.splitlines()))
+
+
+def _memory_lines(setup: TrainingSetup) -> list[tuple[str, str]]:
+    """Compare a step with the memory of the GPU; [] on other devices and where it is not known."""
+    import torch
+
+    from rgbt.engine.memory import training_advice
+    from rgbt.processes import num_processes
+    from rgbt.requirements import NetworkRecord, TransformRecord, record_of
+
+    session = setup.session
+    share = session.loading.batch_size // num_processes()
+    needed = step_gb(session.spec, share) if session.device.type == "cuda" else None
+    if needed is None:
+        return []
+    size = torch.cuda.get_device_properties(session.device).total_memory / GB
+    if needed > size - SPARE_GB:
+        network = record_of(session.model, NetworkRecord)
+        crop_hw = record_of(session.transform, TransformRecord).crop_hw
+        advice = training_advice(session.trainer, share, network, crop_hw)
+        warn(f"a step of {share} images needs about {needed:.0f} GB of {size:.0f} GB. {advice}")
+    return [("memory", f"about {needed:.0f} GB of {size:.0f} GB")]
+
+
+def _disk_lines(run: RunSpec, folder: Path) -> list[tuple[str, str]]:
+    """Compare the checkpoints of a run with the free disk; [] where their size is not known."""
+    size, free = checkpoint_bytes(run), free_bytes(folder)
+    if size is None:
+        return []
+    if size > free:
+        warn(f"checkpoints need {in_gb(size)}, but {folder} has {in_gb(free)} free.")
+    return [("disk", f"{in_gb(size)} of checkpoints, {in_gb(free)} free")]
 
 
 def announce_upstream(setup: TrainingSetup, name: str, downstream: str, folder: Path) -> None:

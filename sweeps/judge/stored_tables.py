@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import cast, get_args
 
 from rgbt.checks import InputError, check_choice, one_line
-from rgbt.config.compose import available
+from rgbt.config.compose import DEFAULT_SCALE, available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
 from sweeps.judge.judged_table import RESAMPLES, JudgedTable
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import DEFAULT_SCALE, REQUESTED, TAG, RowSeed, TableRequest
+from sweeps.plan.request import REQUESTED, TAG, RowSeed, TableRequest
 from sweeps.plan.table import (
     OWN,
     PUBLISHED,

@@ -43,7 +43,7 @@ class SeedsUntilDecided:
 
         It is the lowest one that some of these rows lack, for each of them. They get it while at
         most one of their seeds is unfinished: no worker is idle, and few runs are made that turn
-        out to be unnecessary. Rows of a claim with a failed run get no seeds.
+        out to be unnecessary. Rows of a claim with a failed or a missing run get no seeds.
         `outcomes` are those of all points until now.
         """
         request = self.judged.request
@@ -69,7 +69,7 @@ class SeedsUntilDecided:
         labels = [row.label for row in request.trained_rows if row.label in named]
         unfinished: set[int] = set()
         for (label, seed), outcome in runs.items():
-            if label in labels and outcome.state == "failed":
+            if label in labels and outcome.state in ("failed", "missing"):
                 return []
             if label in labels and outcome.state != "finished":
                 unfinished.add(seed)

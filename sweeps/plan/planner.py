@@ -11,6 +11,7 @@ from typing import Any
 from rgbt.checks import InputError
 from rgbt.config.compose import compose, with_pixels
 from rgbt.config.overrides import composing
+from rgbt.runs.needs import Lacking, lacking
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
@@ -54,6 +55,7 @@ class Planner:
         self.base = tuple(base)  # overrides that all runs have, e.g. the folder of runs
         self._fingerprints: dict[str, str] = {}
         self._specified: dict[tuple[str, ...], RunSpec] = {}
+        self._checked: set[tuple[str, ...]] = set()
 
     def plan(self, point: Point) -> PlannedPoint:
         """Compose and check all runs of `point`; InputError where something does not fit."""
@@ -77,6 +79,18 @@ class Planner:
             self._fingerprints[name] = str(dataset.fingerprint())
         return self._fingerprints[name]
 
+    def composed(self, point: Point) -> RunSpec | None:
+        """Return the first run of a point, unchecked; None where it cannot be composed."""
+        try:
+            return self.specify((*self.base, *point.runs()[0]), checked=False)
+        except InputError:
+            return None
+
+    def lacking(self, point: Point) -> Lacking:
+        """Return what the runs of a point lack; {} where they cannot be composed."""
+        run = self.composed(point)
+        return {} if run is None else lacking(run)
+
     def row_digest(self, overrides: tuple[str, ...]) -> str:
         """Return the digest of the settings of `overrides`; "" where they do not fit alone."""
         try:
@@ -94,6 +108,9 @@ class Planner:
         is_seed = seed != last and seed.isdecimal()
         same = tuple(others) if is_seed else overrides
         if same not in self._specified:
-            self._specified[same] = specify_run(overrides, checked=checked)
+            self._specified[same] = specify_run(overrides, checked=False)
         run = self._specified[same]
+        if checked and same not in self._checked:
+            run.check()
+            self._checked.add(same)
         return run.with_seed(int(seed)) if is_seed else run

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError, check_choice, nearest, split_list
-from rgbt.config.compose import available
+from rgbt.config.compose import DEFAULT_SCALE, available
 from rgbt.config.options import readable_paths, with_home
 from rgbt.runs.naming import MACHINE_OVERRIDES
 from rgbt.runs.specify import CHECKOUT
@@ -35,8 +35,6 @@ from sweeps.plan.table import (
     world_words,
 )
 from sweeps.point import Outcome, Point
-
-DEFAULT_SCALE = "demo"  # The scale of a run without ``scale=...``
 
 TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
 PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows

@@ -179,7 +179,7 @@ class Table(Strict):
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
         forms: one sentence per form that says what the rows are run as.
-        remarks: footnotes of the whole table, one sentence each.
+        remarks: footnotes of the whole table; a mapping has one for a scale (`remarks_at`).
         design: a factorial design whose rows follow `rows`.
     """
 
@@ -196,7 +196,7 @@ class Table(Strict):
     columns: tuple[Column, ...]
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str | dict[str, str], ...] = ()
     design: Design | None = None
     rows: tuple[Row, ...] = ()
 
@@ -213,7 +213,8 @@ class Table(Strict):
         check_different([row.label for row in self.rows])
         check_different([claim.name for claim in self.claims])
         released = [row.released.at for row in self.rows if row.released]
-        for at in (self.at, *(row.at for row in self.rows), *released):
+        remarks = [remark for remark in self.remarks if isinstance(remark, dict)]
+        for at in (self.at, *(row.at for row in self.rows), *released, *remarks):
             for scale in at or ():
                 check_choice("at", scale, available("scale"))
         if self.regions != "as trained":
@@ -280,6 +281,16 @@ class Table(Strict):
     def runnable_rows(self) -> list[Row]:
         """The rows that the project can run today."""
         return [row for row in self.rows if row.experiment is not None]
+
+    def remarks_at(self, scale: str) -> tuple[str, ...]:
+        """Return the footnotes at a scale: those of all, and those of it or of its files."""
+        found: list[str] = []
+        for remark in self.remarks:
+            if isinstance(remark, str):
+                found.append(remark)
+            elif (name := chosen_scale(scale, remark)) in remark:
+                found.append(remark[name])
+        return tuple(found)
 
     def columns_of(self, row: Row) -> tuple[Column, ...]:
         """Return the columns of the row, in their order: without `Row.without`."""

@@ -16,10 +16,11 @@ from rgbt.config.stored_config import check_targets, parse_trust
 from rgbt.files.atomic import check_writable, is_held, write_atomic
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
+from rgbt.runs.needs import STOPPING
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from sweeps.plan.planner import PlannedPoint, Planner
-from sweeps.point import UNFINISHED, Outcome, Point, varied_keys
+from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
 from sweeps.run.driver import drive
 from sweeps.run.optuna_study import driving
 from sweeps.run.point_state import stored_outcome, work_of
@@ -39,6 +40,7 @@ class PointList:
         more: further points, from the outcomes until now; requested when no point is waiting.
         rank: which waiting point is the next: the one of the highest rank, and `more` is requested
             after each end; None: they are run in their order.
+        announce: says what the runs need, from all outcomes, before the first one starts.
     """
 
     study: str
@@ -48,6 +50,7 @@ class PointList:
     planner: Planner
     more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
     rank: Callable[[Point], float] | None = None
+    announce: Callable[[Sequence[Outcome]], None] | None = None
 
 
 class ListSource:
@@ -70,6 +73,7 @@ class ListSource:
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}  # by the index of the point
         self.errors: dict[int, str] = {}  # why points have no plan, by the same
+        self._missing: set[int] = set()  # of them, those that lack data or a checkout
         self._same: dict[str, list[int]] = {}  # indices of equal points by their key
         self._order: list[PlannedPoint] = []  # the different ones, in the order of execution
         self._running: set[str] = set()  # keys
@@ -85,9 +89,13 @@ class ListSource:
             title = f"{self._list.title}: planning"
             for index, point in enumerate(shown.track(points, description=title), first):
                 self._plan(index, point)
-        if self.errors and (self._strict or not self._plans):
+        wrong = {}
+        for index, reason in self.errors.items():
+            if not self._is_dry or index not in self._missing:
+                wrong[index] = reason
+        if wrong and (self._strict or not self._plans):
             # An error of every point is one of the command and not of a point.
-            index, reason = next(iter(self.errors.items()))
+            index, reason = next(iter(wrong.items()))
             raise InputError(f"{self._points[index].label}: {reason}" if self._plans else reason)
         varied = " ".join(varied_keys(self._points))
         for indices in self._same.values():
@@ -106,7 +114,11 @@ class ListSource:
                 for run in plan.runs:
                     check_targets(run.plain, trust, point.label)
         except InputError as error:
-            self.errors[index] = str(error)
+            lacks = self._list.planner.lacking(point)
+            needed = [lacks[kind] for kind in STOPPING if kind in lacks]
+            self.errors[index] = "; ".join(needed) or str(error)
+            if needed:
+                self._missing.add(index)
         else:
             self._plans[index] = plan
             self._same.setdefault(plan.key, []).append(index)
@@ -156,7 +168,8 @@ class ListSource:
         found = []
         for index, point in enumerate(self._points):
             if index in self.errors:
-                found.append(Outcome(point, "failed", self.errors[index]))
+                state: State = "missing" if index in self._missing else "failed"
+                found.append(Outcome(point, state, self.errors[index]))
                 continue
             plan = self._plans[index]
             outcome = self._outcome(plan)
@@ -224,6 +237,8 @@ def run_points(
         for index, reason in source.errors.items():  # before hours of training
             label = points.points[index].label
             info(f"{label}: {reason.removeprefix(f'{label}: ')}")
+        if points.announce is not None:
+            points.announce(source.outcomes())
         drive(ProgressView(points.title), source, points.runs, settings)
         return source.outcomes()
 

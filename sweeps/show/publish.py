@@ -1,4 +1,4 @@
-"""Prints a judged table, its preview (``dry_run=true``) and what is missing; writes its files."""
+"""Prints a judged table and what is missing; writes its files."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Group
-from rich.text import Text
 
 from rgbt.files.atomic import write_atomic
-from rgbt.tables import ABSENT, TextTable
+from rgbt.tables import TextTable
 from rgbt.terminal import info, path_lines, print_rich, rich_table
 from sweeps.judge.effects import effects_of
 from sweeps.judge.judged_table import JudgedTable
-from sweeps.plan.request import TableRequest
-from sweeps.point import Outcome, State
-from sweeps.run.point_list import estimated_seconds, other_code_line
-from sweeps.run.progress import duration
+from sweeps.point import Outcome
+from sweeps.run.point_list import other_code_line
 from sweeps.score.cells import NO_VALUE
 from sweeps.show.claims import claim_grids, claims_frame, claims_markdown, counted, frame_csv
 from sweeps.show.effects import effects_figure, effects_grids
@@ -28,9 +25,6 @@ from sweeps.show.table import Style, latex, render_table, tidy_csv
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
-TRAINED = "trained, not evaluated for all columns"
 
 
 def publish_table(judged: JudgedTable, outcomes: Sequence[Outcome], out: Path) -> int:
@@ -105,6 +99,8 @@ def _report_missing(judged: JudgedTable, outcomes: Sequence[Outcome]) -> bool:
         info(
             f"{failed} of {len(outcomes)} runs failed, see the footnotes; rerun with retry=failed."
         )
+    if missing := states["missing"]:
+        info(f"{missing} of {len(outcomes)} runs are missing something, see the footnotes.")
     others = states["running"] + states["waiting"]
     if others:
         info(f"{others} of {len(outcomes)} runs are not finished; rerun the command later.")
@@ -112,33 +108,3 @@ def _report_missing(judged: JudgedTable, outcomes: Sequence[Outcome]) -> bool:
     if other_code:
         info(other_code)
     return failed > 0 or any(cell.mark == NO_VALUE for cell in judged.scored.cells.values())
-
-
-def print_preview(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> None:
-    """Print the runs of a table with their states, and what is left to do."""
-    if outcomes:
-        rows = [_preview_row(outcome) for outcome in outcomes]
-        title = f"{request.name}, scale={request.scale}: runs of the cells"
-        header = ("cell", "state", "seconds", "run", "reason")
-        print_rich(rich_table(TextTable(title, header, tuple(rows))))
-    states = Counter(outcome.state for outcome in outcomes)
-    counts = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
-    lines = [f"{len(outcomes)} runs: {counts or 'none'}."]
-    if len(outcomes) > states["finished"]:
-        left = estimated_seconds(outcomes, workers)
-        known = duration(left) if left is not None else "known when one run is finished"
-        lines.append(f"Time left with workers={workers}, without further evaluations: {known}.")
-    other_code = other_code_line(outcomes)
-    if other_code:
-        lines.append(other_code)
-    print_rich(Text("\n".join(lines)))
-
-
-def _preview_row(outcome: Outcome) -> tuple[str, ...]:
-    return (
-        outcome.point.label,
-        outcome.state,
-        ABSENT if outcome.seconds is None else f"{outcome.seconds:.0f}",
-        " ".join(outcome.keys) or ABSENT,
-        outcome.reason or (TRAINED if outcome.is_trained else ""),
-    )

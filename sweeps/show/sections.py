@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError, one_line
+from rgbt.config.compose import DEFAULT_SCALE
 from rgbt.metrics import names
 from rgbt.metrics.named import value
 from rgbt.runs.folder import GROUP
@@ -16,7 +17,7 @@ from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.effects import effects_of
 from sweeps.judge.judged_table import JudgedTable
-from sweeps.plan.request import DEFAULT_SCALE, TAG
+from sweeps.plan.request import TAG
 from sweeps.run.progress import duration
 from sweeps.score.efficiency import million_parameters
 from sweeps.score.reader import SEED, RunReader

@@ -49,7 +49,7 @@ def render_table(
     table = scored.table
     footnotes: list[str] = []  # in the order of their first use
     title = f"{table.paper}, {table.number}: {table.caption}"
-    title = _noted(title, table.remarks, footnotes)
+    title = _noted(title, table.remarks_at(scored.scale), footnotes)
     header = ["", "", "seeds"]
     for column in table.columns:
         header.append(_noted(column.name, () if column.printed else (NOT_PRINTED,), footnotes))

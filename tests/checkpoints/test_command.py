@@ -14,8 +14,8 @@ import yaml
 
 from rgbt.checkpoints.files import read
 from rgbt.checkpoints.load import plan_for
-from rgbt.checkpoints.starts import RECIPES, STARTS
 from rgbt.config.compose import available
+from rgbt.runs.starts import RECIPES, STARTS
 from rgbt.weights import entry
 from tests.checkpoints.files import network, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file

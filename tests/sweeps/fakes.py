@@ -20,6 +20,7 @@ from rgbt.config.compose import conf_dir
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import number_of_regions
 from rgbt.runs.folder import Description, RunFolder, counts_name, is_finished
+from rgbt.runs.needs import Lacking
 from rgbt.runs.result import RunResult
 from rgbt.tracking.tracker import Tracking
 from sweeps.plan.measurement import Words, measurement_of
@@ -87,9 +88,16 @@ class FakePlanner:
     """Stands for `Planner`; points with "wrong" do not fit."""
 
     def plan(self, point: Point) -> PlannedPoint:
-        if "wrong" in point.overrides:
+        if {"wrong", "data", "checkout"} & set(point.overrides):
             raise InputError("wrong=1 is no key.")
         return plan_of(point)
+
+    def composed(self, point: Point) -> Any:
+        return None
+
+    def lacking(self, point: Point) -> Lacking:
+        """Points with "data" lack their data set, those with "checkout" the code of an author."""
+        return {word: f"no {word}" for word in ("data", "checkout") if word in point.overrides}
 
 
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:

@@ -59,7 +59,12 @@ class QuickPlanner(FakePlanner):
         return super().plan(point)
 
     def specify(self, words: Sequence[str]) -> Any:
-        return SimpleNamespace(key=words[0], model=SimpleNamespace(target=words[0]))
+        return SimpleNamespace(key=words[0])
+
+    def composed(self, point: Point) -> Any:
+        plain: dict[str, Any] = dict.fromkeys(("model", "scheme"), {"_target_": point.overrides[0]})
+        plain |= {"data": {"batch_size": 2}, "scale": {}, "trainer": {"max_steps": 2}}
+        return SimpleNamespace(plain=plain, pending=())
 
 
 @pytest.fixture
@@ -144,13 +149,18 @@ def test_commands_and_dry_run_have_the_order_with_minutes(
     commands = (place / "file").read_text().splitlines()
     assert [line.partition("+experiment=")[2].split()[0] for line in commands] == order
     assert run(place, dry_run=True) == (0, [])
-    lines = [line.split() for line in capsys.readouterr().out.splitlines() if "seed=0" in line]
+    said = capsys.readouterr().out
+    assert "Time with workers=1: known after the first run." in said
+    lines = [line.split() for line in said.splitlines() if "seed=0" in line]
     assert [line[0] for line in lines] == order
-    assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
-    assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
+    assert lines[0][2:] == ["my/two", "1.00", "-", "-"]
+    assert lines[-1][2:] == ["my/two", "0.50", "-", "-"]
     assert not (place / "runs").exists()
     run(place, archive=None)
-    run(place, dry_run=True)
+    run(place, dry_run=True, seeds="3")
+    said = capsys.readouterr().out
+    assert "Time with workers=1: 25 s, without upstream runs" in said, "ten runs of 2.5 s"
+    assert said.count(" 2 s ") == 10
     assert not (place / "results").exists(), "nothing is added"
 
 

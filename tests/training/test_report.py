@@ -12,8 +12,10 @@ from typing import Any
 import pytest
 import torch
 
+from rgbt.requirements import NetworkRecord, TransformRecord
 from rgbt.run import main
-from rgbt.training.report import device_line
+from rgbt.training.report import _memory_lines, device_line
+from sweeps.plan.planner import specify_run
 from tests.commands import Call, Trained, short, words_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,6 +47,32 @@ def test_a_finished_run_is_shown_without_torch_and_mlflow(words: list[str]) -> N
     assert done.returncode == 0, done.stderr
     assert "is already finished" in done.stderr
     assert "mIoU" in done.stdout
+
+
+@pytest.mark.parametrize(("batch_size", "fits"), [(14, True), (40, False)])
+def test_memory_of_a_gpu_is_compared_with_a_step(
+    batch_size: int, fits: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Swin-S with CRM needs 49 GB at batch 14, as counted, and 136 GB at batch 40."""
+    run = specify_run(("+experiment=crm", "scale=paper"), checked=False)
+    network = SimpleNamespace(record=NetworkRecord(recomputed=("blocks",)))
+    session: Any = SimpleNamespace(
+        spec=run,
+        device=torch.device("cuda"),
+        loading=SimpleNamespace(batch_size=batch_size),
+        trainer=run.trainer,
+        model=network,
+        transform=SimpleNamespace(record=TransformRecord()),
+    )
+    setup: Any = SimpleNamespace(session=session)
+    card = SimpleNamespace(total_memory=85e9)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: card)
+    needed = "49" if fits else "136"
+    assert _memory_lines(setup) == [("memory", f"about {needed} GB of 85 GB")]
+    said = capsys.readouterr().err
+    assert ("trainer.activation_checkpointing=true" in said) != fits
+    session.device = torch.device("cpu")
+    assert _memory_lines(setup) == []
 
 
 def test_a_finished_run_is_compared_with_the_present_files(

@@ -53,6 +53,18 @@ def previewed(desk: ListDesk) -> list[str]:
     return [outcome.state for outcome in preview_points(desk.points, desk.settings)]
 
 
+def test_points_that_lack_something_are_missing(tmp_path: Path) -> None:
+    """They have not failed; a plan shows them even where nothing else is left."""
+    desk = ListDesk(tmp_path, named("x=0", "data", "checkout", "wrong"))
+    outcomes = preview_points(desk.points, desk.settings)
+    assert [outcome.state for outcome in outcomes] == ["waiting", "missing", "missing", "failed"]
+    assert [outcome.reason for outcome in outcomes[1:3]] == ["no data", "no checkout"]
+    assert previewed(ListDesk(tmp_path, named("data", "checkout"))) == ["missing", "missing"]
+    desk = ListDesk(tmp_path, named("data"))
+    with pytest.raises(InputError, match="no data"):
+        desk.run()
+
+
 def test_a_wrong_point_of_a_strict_list_starts_nothing(tmp_path: Path) -> None:
     desk = ListDesk(tmp_path, named("x=0", "wrong"))
     with pytest.raises(InputError, match="wrong: wrong=1"):

@@ -8,6 +8,8 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from rgbt.tables import TextTable
 from sweeps.plan.table import Column, Row
 from sweeps.score.cells import ScoredTable, TableCell, score, size_marks
@@ -54,6 +56,17 @@ def test_paper_scale_is_not_called_small() -> None:
     shown = grid(wide())
     assert shown.rows[1] == ("", "published", "", "48.00", "49.25", "-", "-")
     assert SMALL.format(scale="paper") not in shown.notes
+
+
+@pytest.mark.parametrize(("scale", "is_small"), [("demo", True), ("bench", True), ("paper", False)])
+def test_a_footnote_of_demo_scale_is_shown_where_its_networks_are(
+    scale: str, is_small: bool
+) -> None:
+    rows = (Row(label="a", experiment="crm"),)
+    made = table(rows, COLUMNS[:1], remarks=("all", {"demo": "small"}))
+    notes = grid(score("t", made, {("a", 0): failed("broke.")}, scale=scale)).notes
+    assert "[1] all" in notes
+    assert ("[2] small" in notes) == is_small
 
 
 def test_footnotes_are_numbered_and_shared() -> None:

@@ -1,15 +1,24 @@
-"""Published files that recipes start from (``starts.yaml``), compared with a user's file."""
+"""Published files that recipes start from (``starts.yaml``), by file, recipe and network."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
+from rgbt.config.compose import load_choice
 from rgbt.files.yaml_files import read_yaml
+
+# Settings of a network that decide which file fits it.
+SIZES = (
+    *("_target_", "depth", "depths", "embed_dim", "embed_dims", "base_width", "patch"),
+    *("num_registers", "mlp"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +49,46 @@ class SameStart:
                 named.append(experiment)
         return tuple(named)
 
+    def by_network(self) -> dict[str, list[str]]:
+        """Return the files of each network (``model=``) of the row, the one to get first."""
+        found: dict[str, list[str]] = {}
+        for file in self.files:
+            for model in _BY_FILE[file].models:
+                if model.startswith(self.model):
+                    found.setdefault(model, []).append(file)
+        return found
+
 
 _TABLE = read_yaml(Path(__file__).with_name("starts.yaml"))
 STARTS: tuple[Start, ...] = TypeAdapter(tuple[Start, ...]).validate_python(_TABLE["files"])
 RECIPES: tuple[SameStart, ...] = TypeAdapter(tuple[SameStart, ...]).validate_python(
     _TABLE["recipes"]
 )
+_BY_FILE = {start.file: start for start in STARTS}
+
+
+def starts_of(experiment: str, model: Mapping[str, Any]) -> tuple[Start, ...]:
+    """Return the files for a network of an experiment, the one to get first; (): random values.
+
+    `model` are plain values of the network: what fits is decided by its sizes (`SIZES`), not by its
+    name.
+    """
+    found = []
+    for recipe in RECIPES:
+        for name, files in recipe.by_network().items() if recipe.named([experiment]) else ():
+            if sizes_of(name) == {key: model.get(key) for key in SIZES}:
+                found += [_BY_FILE[file] for file in files]
+    return tuple(found)
+
+
+@cache
+def sizes_of(name: str) -> Mapping[str, Any]:
+    """Return the values of `SIZES` of a choice of ``conf/model/``; None where it has no such."""
+    plain = load_choice(f"model/{name}")
+    for default in plain.pop("defaults", ()):  # dinov3 is a change of dinov2_vits14
+        if isinstance(default, str) and default != "_self_":
+            plain = load_choice(f"model/{default}") | plain
+    return {key: plain.get(key) for key in SIZES}
 
 
 def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterator[tuple[str, str]]:
