@@ -19,7 +19,17 @@ FILES = [
 ]
 
 ALONE = {
-    *("types", "checks", "ranges", "randomness", "processes", "cores", "class_scores", "averaging", "fusion")
+    *(
+        "types",
+        "checks",
+        "ranges",
+        "randomness",
+        "processes",
+        "cores",
+        "class_scores",
+        "averaging",
+        "fusion",
+    )
 }
 BASE = ALONE | {"dataset", "requirements", "files", "terminal", "tables"}
 SHARED = BASE | {"geometry"}
