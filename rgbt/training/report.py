@@ -42,12 +42,15 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     With rare class sampling, also the probability of each class; on CUDA, the memory of a step
     where it was counted. It warns where disk or memory are too small.
     """
+    from rgbt.engine.device import compiles_functions
+
     session, trainer = setup.session, setup.session.trainer
+    compiled = ", functions compiled" * compiles_functions(trainer, session.device)
     trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
     others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
     counts = [f"{len(names)} {split}" for split, names in session.names.items()]
     lines = [
-        ("device", device_line(session)),
+        ("device", device_line(session) + compiled),
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
         ("sizes", ", ".join(f"{name} {text}" for name, text in setup.sizes.items())),
