@@ -136,7 +136,7 @@ def test_error_of_the_thread_ends_training_at_the_next_step(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     watched(monkeypatch, full)
-    made, log = make(tmp_path, max_steps=10**6, eval_every=10**6, checkpoint_minutes=OFTEN)
+    made, log = make(tmp_path, max_steps=30, eval_every=30, checkpoint_minutes=OFTEN)
 
     def endless() -> Iterator[Batch]:
         for batch in batches(0):
