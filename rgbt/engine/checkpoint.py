@@ -25,6 +25,7 @@ from rgbt.averaging import AveragedNetwork
 from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, save
 from rgbt.checks import InputError, RunError, not_finite, one_line
 from rgbt.engine.settings import TrainerSettings
+from rgbt.files.plain_files import check_links, inside
 from rgbt.processes import computed_once
 
 LAST, BEST = "last.pt", "best.pt"  # names in the run folder
@@ -251,8 +252,12 @@ def commit(folder: Path, payload: dict[str, Any], best: Best | None) -> None:
 
 
 def settle(folder: Path, best_step: int) -> None:
-    """Name the files that were written for ``last.pt`` with this best step, and remove others."""
+    """Name the files that were written for ``last.pt`` with this best step, and remove others.
+
+    InputError: one of them is a link that leads out of the folder.
+    """
     for coming in folder.glob(f"{NEXT}*"):
+        check_links(inside(coming, folder))
         if coming.name == f"{NEXT}{best_step}":
             for file in filter(Path.is_file, coming.rglob("*")):
                 target = folder / file.relative_to(coming)

@@ -13,7 +13,7 @@ from torch import nn
 
 from rgbt.checkpoints.files import save
 from rgbt.checks import InputError, RunError
-from rgbt.engine.checkpoint import State, load_checkpoint, load_last, restore_weights
+from rgbt.engine.checkpoint import State, load_checkpoint, load_last, restore_weights, settle
 from rgbt.files.atomic import write_atomic
 from tests.engine.test_trainer import batches, make
 
@@ -118,3 +118,16 @@ def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) ->
     for model in (nn.Linear(2, 4), nn.Linear(2, 3, bias=False), nn.Linear(2, 3).double()):
         with pytest.raises(InputError, match="of another model: .*(weight|bias)"):
             restore_weights(model, weights, tmp_path / "other.pt")
+
+
+@pytest.mark.parametrize("place", ["next_3", "next_3/figures"])
+def test_nothing_outside_of_the_run_folder_is_moved_or_removed(tmp_path: Path, place: str) -> None:
+    outside, folder = tmp_path / "mine", tmp_path / "run"
+    outside.mkdir()
+    (outside / "notes.txt").write_text("mine")
+    (folder / place).parent.mkdir(parents=True)
+    (folder / place).symlink_to(outside)
+    for best_step in (3, 4):  # to be named, and to be removed
+        with pytest.raises(InputError, match="a link that leads out of"):
+            settle(folder, best_step)
+        assert (outside / "notes.txt").read_text() == "mine"
