@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 import torch
 
+from rgbt.engine.checkpoint import State
 from rgbt.engine.device import compiles_functions
 from rgbt.fusion import compile_fused, fused
 from tests.engine.test_device import settings
+from tests.engine.test_trainer import batches, make
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
 
@@ -62,6 +64,35 @@ def test_functions_are_compiled_on_gpus_that_can(
     monkeypatch.setattr("rgbt.engine.device.shutil.which", lambda name: found)
     monkeypatch.setattr("rgbt.engine.device.find_spec", lambda name: object() if there else None)
     assert compiles_functions(settings(compile=setting), device) is expected
+
+
+@pytest.mark.parametrize("setting", ["functions", "none"])
+def test_a_training_compiles_its_steps_and_not_its_evaluation(
+    setting: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(torch, "compile", lambda function, dynamic: lambda: "compiled")
+    called: dict[str, str] = {}
+
+    @fused
+    def here() -> str:
+        return "as it is"
+
+    trainer, _ = make(tmp_path, compile=setting, max_steps=1)
+    phases = trainer.phases
+
+    def step(*arguments: Any) -> Any:
+        called["step"] = here()
+        return phases(*arguments)
+
+    def evaluate(number: int, network: torch.nn.Module) -> float:
+        called["evaluation"] = here()
+        return 0.5
+
+    trainer.phases, trainer.hooks.evaluate = step, evaluate
+    trainer.fit(batches(0), State(seed=0))
+    expected = "compiled" if setting == "functions" else "as it is"
+    assert called == {"step": expected, "evaluation": "as it is"}
+    assert here() == "as it is"
 
 
 STEPS = """

@@ -337,10 +337,10 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
 def mask_sums(x: Tensor, t: Tensor, w: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Return the sums over points of BCE, s t and s + t of `mask_and_dice`, with weights w."""
     bce, s = F.softplus(x) - x * t, x.sigmoid()
-    if w is not None:
-        bce, s, t = w * bce, s, w * t
-        return bce.sum(-1), (s * t).sum(-1), (w * s).sum(-1) + t.sum(-1)
-    return bce.sum(-1), (s * t).sum(-1), s.sum(-1) + t.sum(-1)
+    if w is None:
+        return bce.sum(-1), (s * t).sum(-1), s.sum(-1) + t.sum(-1)
+    t = w * t
+    return (w * bce).sum(-1), (s * t).sum(-1), (w * s).sum(-1) + t.sum(-1)
 
 
 def _chunk_bytes(x: Tensor) -> int:

@@ -76,3 +76,13 @@ def test_one_kernel_attends_as_the_plain_formula(windows: int) -> None:
     weight = torch.rand(expected.shape, generator=generator).double()
     first, second = (torch.autograd.grad((x * weight).sum(), bias)[0] for x in (expected, found))
     torch.testing.assert_close(second, first, rtol=1e-11, atol=1e-12)
+
+
+def test_the_network_keeps_no_samples() -> None:
+    attention = head.DeformableAttention(64, heads=2, num_levels=3)
+    tokens = torch.rand(2, LENGTH, 64)
+    kept: list[Tensor] = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x) or x, lambda x: x):
+        attention(tokens, tokens, LEVELS)
+    samples = 2 * 64 * LENGTH * head.POINTS  # of one level
+    assert max(x.numel() for x in kept) < samples
