@@ -31,7 +31,7 @@ from rgbt.types import IGNORE, Batch, Output
 
 # Size of the largest temporary of a step on a CPU, whose cache a larger one does not fit, and on a
 # GPU, where fewer and larger kernels are faster.
-CHUNK_BYTES, CHUNK_BYTES_GPU = 16 * 2**20, 512 * 2**20
+CHUNK_BYTES, CHUNK_BYTES_GPU = 16 * 2**20, 256 * 2**20
 
 
 @dataclass(kw_only=True, eq=False)
