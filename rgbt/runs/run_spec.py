@@ -259,7 +259,10 @@ class RunSpec:
         model = self.plain["model"]
         if model.get("_target_") != EXTERNAL or checkout_code(model):
             return self.key == run.key
-        return settings_digest(self.plain) == settings_digest(run.settings)
+        # Runs are archived for years: how often they saved, say, has other names today.
+        known = self.plain["trainer"]
+        trainer = {key: value for key, value in run.settings["trainer"].items() if key in known}
+        return settings_digest(self.plain) == settings_digest({**run.settings, "trainer": trainer})
 
     @property
     def names_files(self) -> bool:

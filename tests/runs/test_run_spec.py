@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -13,7 +15,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.files.plain_files import write_json
 from rgbt.runs.run_spec import RunSpec
-from rgbt.runs.specify import load_spec, specify
+from rgbt.runs.specify import load_spec, requested_run, specify
 
 
 def spec_of(experiment: str, *overrides: str) -> RunSpec:
@@ -207,3 +209,14 @@ def test_measured_later_as_many_scenes_are_added(words: list[str], expected: int
     old = stored()
     del old["consistency"]["scenes_per_count"]
     assert load_spec(old, ["consistency=views"]).plain["consistency"]["scenes_per_count"] == 1
+
+
+def test_archived_run_without_its_checkout_is_found_by_settings(tmp_path: Path) -> None:
+    """Its settings of the trainer had other names when it was archived."""
+    words = ["+experiment=mfnet", "model=external/gmnet", f"model.checkout={tmp_path}"]
+    spec = requested_run(compose(words), words)
+    trainer = {**spec.plain["trainer"], "checkpoint_every": 100}
+    for changes, expected in (({}, True), ({"precision": "bf16-mixed"}, False)):
+        settings = {**spec.plain, "trainer": trainer | changes}
+        run: Any = SimpleNamespace(key="of its files", settings=settings)
+        assert spec.is_run(run) is expected

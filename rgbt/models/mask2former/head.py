@@ -148,7 +148,8 @@ class DeformableAttention(nn.Module):
         centre, scale = centre_grid(levels, query.device)
         grid = torch.addcmul(centre, offset, scale)
         read = SampleSum.apply if torch.is_grad_enabled() else sample_sum
-        total = read(value.float(), grid.float(), weights.float(), levels)
+        dtype = torch.promote_types(value.dtype, grid.dtype)  # under autocast float32
+        total = read(value.to(dtype), grid.to(dtype), weights.to(dtype), levels)
         return _project(self.output_proj, total.view(batch, dim, length)).transpose(1, 2)
 
 
@@ -156,7 +157,7 @@ def sample_sum(value: Tensor, grid: Tensor, weights: Tensor, levels: Levels) -> 
     """Read maps at points, and return the weighted sum of what was read for every token.
 
     (R, C, S) values of all levels, (R, levels, points, 2, S) positions, (R, levels * points, S)
-    weights -> (R, C, S); float32.
+    weights -> (R, C, S); all of one dtype.
     """
     total: Tensor | None = None
     shares = torch.split(weights, POINTS, 1)

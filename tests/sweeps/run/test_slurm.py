@@ -144,7 +144,7 @@ def test_full_disk_names_its_file_and_is_retried(short: Sweep) -> None:
     short.varied = "seed=0"
     process = short.start("hydra.launcher.setup=[ulimit -f 500]")
     assert short.end(process) == 1
-    reason = r"best\.pt: File too large \([\d.]+ MB are needed, [\d.]+ MB are free\)"
+    reason = r"last\.pt: File too large \([\d.]+ MB are needed, [\d.]+ MB are free\)"
     assert re.search(rf"failed .*{reason}", short.text), short.text
     assert short.end(short.start()) == 1, "it is known"
     assert short.jobs() == {}
