@@ -13,6 +13,8 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
+from rgbt.checks import InputError, one_line
+
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 
@@ -29,9 +31,15 @@ def fused(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
     @wraps(function)
     def call(*arguments: Given.args, **keywords: Given.kwargs) -> Found:
-        if _is_compiled and not torch.compiler.is_compiling():
+        if not _is_compiled or torch.compiler.is_compiling():
+            return function(*arguments, **keywords)
+        try:
             return compiled()(*arguments, **keywords)
-        return function(*arguments, **keywords)
+        except Exception as error:
+            if not type(error).__module__.startswith("torch._"):  # such as a lack of memory
+                raise
+            said = f"{function.__name__} cannot be compiled ({one_line(error)})"
+            raise InputError(f"trainer.compile: {said}; set trainer.compile=none.") from error
 
     return call
 

@@ -49,6 +49,7 @@ RGBT: dict[str, set[str]] = {
     **dict.fromkeys(ALONE, set()),
     "dataset": {"types", "requirements"},
     "requirements": {"types", "checks"},
+    "fusion": {"checks"},
     "tables": {"checks", "metrics"},
     "terminal": {"checks", "tables"},
     **dict.fromkeys(("files", "runtime", "geometry"), BASE),

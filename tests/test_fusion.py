@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from torch._dynamo.exc import TorchDynamoException
 
+from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.engine.device import compiles_functions
 from rgbt.fusion import compile_fused, fused
@@ -43,6 +45,25 @@ def test_marked_functions_are_compiled_inside_the_block_alone(monkeypatch: Any) 
     with pytest.raises(ValueError, match="stops"), compile_fused(True):
         raise ValueError("stops")
     assert (double(1), compiled) == (2, ["double"])
+
+
+def test_what_cannot_be_compiled_names_the_setting(monkeypatch: Any) -> None:
+    def failing(function: Any, *, dynamic: bool) -> Any:
+        def call(error: Exception) -> None:
+            raise error
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", failing)
+
+    @fused
+    def step(error: Exception) -> None: ...
+
+    with compile_fused(True):
+        with pytest.raises(InputError, match="trainer.compile: step .*no compiler.*compile=none"):
+            step(TorchDynamoException("no compiler\nfound"))
+        with pytest.raises(torch.OutOfMemoryError):
+            step(torch.OutOfMemoryError("full"))
 
 
 @pytest.mark.parametrize(
