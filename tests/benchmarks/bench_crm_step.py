@@ -106,7 +106,7 @@ def their_step(case: str, checkout: Path) -> Callable[[], object]:
 
 
 def serve(pipe: Connection, case: str, checkout: Path | None) -> None:
-    """Make a step whenever asked to; answer with CPU and wall seconds and the peak in MiB."""
+    """Make a step for every request; answer with CPU and wall seconds and the peak in MiB."""
     warnings.filterwarnings("ignore")
     torch.set_num_threads(2)
     step = our_step(case) if checkout is None else their_step(case, checkout)

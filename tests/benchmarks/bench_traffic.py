@@ -71,8 +71,8 @@ class Traffic(TorchDispatchMode):
             if isinstance(leaf, Tensor):
                 moved += leaf.numel() * leaf.element_size()
         shape = str(tuple(found.shape)) if isinstance(found, Tensor) else ""
-        self.bytes[place_of(sys._getframe(1)), name, shape] += moved
-        self.calls[place_of(sys._getframe(1)), name, shape] += 1
+        self.bytes[code_of(sys._getframe(1)), name, shape] += moved
+        self.calls[code_of(sys._getframe(1)), name, shape] += 1
         if func._overloadpacket in flop_registry:
             self.flops += flop_registry[func._overloadpacket](
                 *args, **(kwargs or {}), out_val=found
@@ -95,7 +95,7 @@ class Traffic(TorchDispatchMode):
             for leaf in (*leaves, *tree_leaves(found)):
                 if isinstance(leaf, Tensor):
                     moved += leaf.numel() * leaf.element_size()
-            key = place_of(sys._getframe(1)), f"fused {function.__name__}", ""
+            key = code_of(sys._getframe(1)), f"fused {function.__name__}", ""
             self.kernels["fused"] += 1
             self.bytes[key] += moved
             self.calls[key] += 1
@@ -108,7 +108,7 @@ def _has_gradient(leaf: object) -> bool:
     return isinstance(leaf, Tensor) and leaf.requires_grad
 
 
-def place_of(frame: Any) -> str:
+def code_of(frame: Any) -> str:
     """Name the innermost function of rgbt that is being called; the backward pass has none."""
     while frame is not None:
         path = frame.f_code.co_filename

@@ -1,4 +1,4 @@
-"""The plan of tables: what is said of every row before the first run starts."""
+"""The plan of tables: what they show of every row before the first run starts."""
 
 from __future__ import annotations
 
