@@ -122,8 +122,9 @@ from pathlib import Path
 from rgbt.assembly.training_setup import set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import Hooks, Trainer
+from rgbt.engine.trainer import Hooks
 from rgbt.runs.specify import specify
+from tests.benchmarks.loop import trainer_of
 import torch._dynamo.utils as seen
 words = ["+experiment=crm", "+debug=smoke", "tracking=none", "trainer.accelerator=cpu"]
 words += ["trainer.max_steps=6", "trainer.log_every=1", f"trainer.compile={sys.argv[1]}"]
@@ -133,11 +134,7 @@ hooks = Hooks()
 def log(step, values):
     losses.append(values["loss"]); graphs.append(seen.counters["stats"]["unique_graphs"])
 hooks.log = log
-trainer = Trainer(
-    fabric=setup.fabric, settings=setup.session.trainer, phases=setup.scheme.phases,
-    model=setup.model, others=setup.others, optimizers=setup.optimizers, schedule=setup.schedule,
-    steps_per_epoch=100, folder=Path(tempfile.mkdtemp()), hooks=hooks,
-)
+trainer = trainer_of(setup, Path(tempfile.mkdtemp()), hooks)
 trainer.fit(setup.batches(range(6)), State(seed=0))
 print(json.dumps([losses, graphs]))
 """

@@ -148,10 +148,11 @@ class SetCriterion:
         layers, passes, images, queries = class_logits.shape[:4]
         probabilities = class_logits.float().softmax(-1)[..., :-1].flatten(0, 1)
         sets = _chunk_bytes(mask_logits) // (4 * images * queries * self.num_points)
-        step = max(1, min(sets, passes))  # passes of one layer, or whole layers
+        # At a time, passes of one layer, or all passes of layers.
+        step, layer_step = max(1, min(sets, passes)), max(1, sets // passes)
         costs = []
-        for layer in range(0, layers, max(1, sets // passes)):
-            of_layers = mask_logits[layer : layer + max(1, sets // passes)]
+        for layer in range(0, layers, layer_step):
+            of_layers = mask_logits[layer : layer + layer_step]
             for start in range(0, passes, step):
                 masks = of_layers[:, start : start + step]
                 drawn = points.matcher(len(masks) * masks.shape[1], images, self.num_points)

@@ -15,7 +15,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from statistics import median
@@ -28,8 +27,9 @@ from torch import nn
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import Hooks, Trainer
+from rgbt.engine.trainer import Hooks
 from rgbt.runs.specify import specify
+from tests.benchmarks.loop import trainer_of
 
 EVERY, NEVER = 5, 1440
 
@@ -58,20 +58,8 @@ def measured(
     setup: TrainingSetup, folder: Path, minutes: int, steps: int
 ) -> dict[str, list[float]]:
     """Seconds between two steps, by what is copied there, and of the thread."""
-    settings = replace(setup.session.trainer, max_steps=10**6, eval_every=EVERY, log_every=1)
-    hooks = Rising()
-    trainer = Trainer(
-        fabric=setup.fabric,
-        settings=replace(settings, checkpoint_minutes=minutes),
-        phases=setup.scheme.phases,
-        model=setup.model,
-        others=setup.others,
-        optimizers=setup.optimizers,
-        schedule=setup.schedule,
-        steps_per_epoch=10,
-        folder=folder,
-        hooks=hooks,
-    )
+    hooks, lengths = Rising(), {"max_steps": 10**6, "eval_every": EVERY, "log_every": 1}
+    trainer = trainer_of(setup, folder, hooks, checkpoint_minutes=minutes, **lengths)
     found: dict[str, list[float]] = defaultdict(list)
 
     def due() -> None:

@@ -29,9 +29,9 @@ from torch import Tensor
 from rgbt.assembly.training_setup import set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.device import keep_memory
-from rgbt.engine.trainer import Hooks, Trainer
 from rgbt.runs.specify import specify
 from rgbt.types import Batch
+from tests.benchmarks.loop import trainer_of
 from tests.benchmarks.release_step import release_step
 
 CASES = {
@@ -66,18 +66,7 @@ def our_step(case: str) -> Callable[[], object]:
     keep_memory()
     words = words_of(case)
     setup = set_up_training(specify(compose(words), words), upstream_finished=False)
-    trainer = Trainer(
-        fabric=setup.fabric,
-        settings=setup.session.trainer,
-        phases=setup.scheme.phases,
-        model=setup.model,
-        others=setup.others,
-        optimizers=setup.optimizers,
-        schedule=setup.schedule,
-        steps_per_epoch=1000,
-        folder=Path(mkdtemp()),
-        hooks=Hooks(),
-    )
+    trainer = trainer_of(setup, Path(mkdtemp()))
     setup.model.train()
     _, batch_size, hw, _ = CASES[case]
     image, label, _ = draw(batch_size, hw)

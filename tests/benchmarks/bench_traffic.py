@@ -29,11 +29,11 @@ from torch.utils.flop_counter import flop_registry
 from rgbt.assembly.training_setup import set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import Hooks, Trainer
 from rgbt.losses import set_criterion
 from rgbt.models.mask2former import head
 from rgbt.runs.specify import specify
 from tests.benchmarks.gpu_step import write_images
+from tests.benchmarks.loop import trainer_of
 
 # Operations that make no new memory.
 VIEWS = frozenset(
@@ -155,18 +155,7 @@ def count(network: str, batch_size: int, *, is_fused: bool = False) -> Traffic:
         words += ["data.num_workers=0", f"recipe.batch_size={batch_size}", "scale.pretrained=false"]
         words += [f"trainer.compile={'functions' if is_fused else 'none'}"]
         setup = set_up_training(specify(compose(words), words), upstream_finished=False)
-        trainer = Trainer(
-            fabric=setup.fabric,
-            settings=setup.session.trainer,
-            phases=setup.scheme.phases,
-            model=setup.model,
-            others=setup.others,
-            optimizers=setup.optimizers,
-            schedule=setup.schedule,
-            steps_per_epoch=1000,
-            folder=Path(folder),
-            hooks=Hooks(),
-        )
+        trainer = trainer_of(setup, Path(folder))
         batch = next(setup.batches(range(2)))
         try:
             trainer.fit(_Batches(batch, traffic), State(seed=0))

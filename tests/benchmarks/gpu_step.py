@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from statistics import median
@@ -29,9 +28,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import WAIT_SHARE, Hooks, Trainer
+from rgbt.engine.trainer import WAIT_SHARE, Hooks
 from rgbt.runs.provenance import code, machine
 from rgbt.runs.specify import specify
+from tests.benchmarks.loop import trainer_of
 
 NEVER, KERNELS = 1_000_000, 15
 STEPS = {"cuda": (3, 8), "cpu": (1, 2)}  # to warm up, and timed
@@ -152,18 +152,7 @@ def train(
     recorded: list[dict[str, float]] = []
     hooks = Hooks()
     hooks.log = lambda step, values: recorded.append(values)  # type: ignore[method-assign]
-    trainer = Trainer(
-        fabric=setup.fabric,
-        settings=replace(setup.session.trainer, **changes),
-        phases=setup.scheme.phases,
-        model=setup.model,
-        others=setup.others,
-        optimizers=setup.optimizers,
-        schedule=setup.schedule,
-        steps_per_epoch=NEVER,
-        folder=folder,
-        hooks=hooks,
-    )
+    trainer = trainer_of(setup, folder, hooks, **changes)
     with suppress(StopIteration):
         trainer.fit(batches, State(seed=0))
     return recorded
