@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import model_validator
 
@@ -15,6 +15,7 @@ Combine = Literal["all", "most", "any", "mean"]
 OTHERS = "others"  # word in `Claim.against`: every other row that has a score or a printed value
 PREVIOUS = "previous"  # word in `Claim.against`: the row before in `Claim.rows`
 
+Unique = TypeVar("Unique", bound=Sequence[object])
 Range = tuple[float, float]
 # Ranges of a difference whose size does not matter.
 HIGHER: Range = (0.0, math.inf)
@@ -27,11 +28,12 @@ class Strict:
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
-def check_different(names: Sequence[str]) -> None:
-    """Refuse names of which one is used twice."""
+def check_different(names: Unique) -> Unique:
+    """Return names or numbers of which none is used twice; ValueError otherwise."""
     for index, name in enumerate(names):
         if name in names[:index]:
             raise ValueError(f"'{name}' is used twice.")
+    return names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +55,7 @@ class Claim(Strict):
         effect: letters of the factors of the table's design; the claim is then about that effect
             on the outcomes `columns`, by the methods `rows`.
         part: of an effect, "trained" or "tested"; default: tested, if the design has that.
+        exploratory: made after a result was seen, so that the seeds of `Table.confirm` do not judge it.
         combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
@@ -71,6 +74,7 @@ class Claim(Strict):
     effect: str = ""
     part: str = ""
     combine: Combine = "all"
+    exploratory: bool = False
     remarks: tuple[str, ...] = ()
 
     @property

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import BeforeValidator, model_validator
+from pydantic import AfterValidator, BeforeValidator, NonNegativeInt, model_validator
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import available, chosen_scale
@@ -179,6 +179,7 @@ class Table(Strict):
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
         forms: one sentence per form that says what the rows are run as.
+        confirm: seeds that judge the claims, declared before any of them is run; (): none.
         remarks: footnotes of the whole table; a mapping has one for a scale (`remarks_at`).
         design: a factorial design whose rows follow `rows`.
     """
@@ -195,6 +196,7 @@ class Table(Strict):
     absent: Literal["released", "exclude"] | None = None
     columns: tuple[Column, ...]
     forms: Mapping[Form, str] = field(default_factory=dict)
+    confirm: Annotated[tuple[NonNegativeInt, ...], AfterValidator(check_different)] = ()
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str | dict[str, str], ...] = ()
     design: Design | None = None
