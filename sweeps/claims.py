@@ -16,7 +16,7 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.judge.judged_table import JudgedClaim
+    from sweeps.judge.judged_claim import JudgedClaim
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,8 @@ class Queue:
             if sizes & set(found.claim.columns):
                 continue
             self._claims += 1
-            if found.word in ("holds", "contradicted"):
+            is_confirmed = found.confirmation is not None
+            if is_confirmed or (found.is_decided and not request.is_confirming):
                 self._decided += 1
                 continue
             named: set[str] = set()

@@ -39,7 +39,13 @@ class Options:
     table: Annotated[
         str, Help("spatialseg/table3, my/ablation (in ./tables), a file, a list, or all")
     ]
-    seeds: Annotated[str, Help("a number (3: 0, 1, 2), a list (0,4,7), or until_decided")] = "1"
+    seeds: Annotated[
+        str,
+        Help(
+            "a number (3: 0, 1, 2), a list (0,4,7), confirm (those that the table declares), or "
+            "until_decided"
+        ),
+    ] = "1"
     max_seeds: Annotated[int, Interval(ge=4, le=1000), Help("most, with until_decided")] = 20
     scale: Annotated[str, Help("demo (minutes, embedded data), bench or paper")] = "demo"
     form: Annotated[
@@ -208,11 +214,19 @@ def _request(options: Options, name: str, words: Sequence[str], planner: Planner
     from sweeps.judge.until_decided import START
     from sweeps.plan.request import make_request, row_digests, seeds_of
 
-    is_adding = options.seeds == "until_decided"
-    seeds = tuple(range(START)) if is_adding else seeds_of(options.seeds)
     request = make_request(
         name, options.scale, words, form=options.form, rows=options.rows, planner=planner
     )
+    is_adding = options.seeds == "until_decided"
+    if options.seeds == "confirm":
+        seeds = request.table.confirm
+        if not seeds:
+            raise InputError(
+                f"seeds=confirm: {request.name} declares none; add a line such as "
+                "confirm: [10, 11, 12, 13] to the table before they are run."
+            )
+    else:
+        seeds = tuple(range(START)) if is_adding else seeds_of(options.seeds)
     if is_adding and not request.table.claims:
         raise InputError(
             f"seeds=until_decided: {request.name} has no claims with these rows; give a number of "

@@ -109,6 +109,16 @@ def base_scores(table: Table, row: Row, name: str) -> list[tuple[float, Column]]
     return scores
 
 
+def is_level(contrast: Contrast, table: Table) -> bool:
+    """Whether a contrast is about how high a score is, not about a difference of scores."""
+    rows = {row.label: row for row in table.rows}
+    total = 0.0
+    for cell in contrast.cells:
+        parts = base_scores(table, rows[cell.row], cell.column)
+        total += cell.weight * sum(weight for weight, _ in parts)
+    return abs(total) > 1e-9
+
+
 def as_claimed(claim: Claim, contrasts: Sequence[float | None]) -> bool | None:
     """Return whether exact values of its contrasts agree with a claim; None: some are missing."""
     values = [value for value in contrasts if value is not None]

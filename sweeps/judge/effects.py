@@ -27,6 +27,9 @@ NOISE: dict[str, Noise] = {TRAINED: "cells", TESTED: "effects"}
 # Name of the line that is no effect: the outcome itself.
 MEAN = "mean of all cells"
 
+# Word for an effect of seeds whose number may depend on results: its interval is no verdict.
+EXPLORED = "explored"
+
 COLUMNS = ["part", "outcome", "method", "against", "effect", "value", "low", "high", "p"]
 COLUMNS += ["p_holm", "shown", "error_seeds", "error_images", "seeds", "cells"]
 
@@ -37,8 +40,9 @@ def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
     Returns:
         one effect a row, with the columns `COLUMNS`: `low` and `high` are the ends of the interval
         over images and seeds, `p_holm` is corrected for the main effects, or the interactions, of a
-        method, `shown` says whether the effect differs from 0 by it, errors are standard errors.
-        And a sentence on each method that lacks runs. Both are empty without a design.
+        method, `shown` says whether the effect differs from 0 by it (of declared seeds alone),
+        errors are standard errors. And a sentence on each method that lacks runs. Both are empty
+        without a design.
     """
     import pandas as pd
 
@@ -53,20 +57,24 @@ def effects_of(judged: JudgedTable) -> tuple[pd.DataFrame, list[str]]:
             continue  # rows=... left it out
         try:
             own = _cells(judged, design, part, method.name, outcome)
-            evidences = _evidences(judged, own, _common_seeds(own))
+            seeds, is_declared = _seeds_of(judged, own)
+            evidences = _evidences(judged, own, seeds)
         except InputError as error:
             lacking.append(f"{part}, {method.name}: {error}")
             continue
-        start = {"part": part, "outcome": outcome, "method": method.name}
-        rows += _lines({**start, "against": ""}, design, evidences)
+        start = {"part": part, "outcome": outcome, "method": method.name, "against": ""}
+        rows += _lines(start, design, evidences, is_declared=is_declared)
         if method.against is None:
             continue
         try:
             other = _cells(judged, design, part, method.against, outcome)
-            differences = _differences(judged, own, other)
+            seeds, is_declared = _seeds_of(judged, [*own, *other])
         except InputError:  # its missing runs are named with that method
             continue
-        rows += _lines({**start, "against": method.against}, design, differences)
+        sides = (_evidences(judged, own, seeds), _evidences(judged, other, seeds))
+        differences = [combine((1.0, -1.0), pair) for pair in zip(*sides, strict=True)]
+        start["against"] = method.against
+        rows += _lines(start, design, differences, is_declared=is_declared)
     return pd.DataFrame(rows, columns=COLUMNS), list(dict.fromkeys(lacking))
 
 
@@ -78,12 +86,15 @@ def _cells(
     return [judged.terms([Cell(1.0, row, outcome, world)]) for row, world in places]
 
 
-def _common_seeds(cells: Sequence[Sequence[Term]]) -> list[int]:
-    """The seeds that every cell has."""
+def _seeds_of(judged: JudgedTable, cells: Sequence[Sequence[Term]]) -> tuple[list[int], bool]:
+    """The seeds of all cells: those that the table declares, or others; and whether declared."""
     shared = set.intersection(*(set(term.counts) for cell in cells for term in cell))
-    if not shared:
+    declared = set(judged.request.table.confirm)
+    if declared and declared <= shared:
+        return sorted(declared), True
+    if not shared - declared:
         raise InputError("its cells have no seed in common; train the same seeds of each cell.")
-    return sorted(shared)
+    return sorted(shared - declared), False
 
 
 def _evidences(
@@ -101,17 +112,8 @@ def _evidences(
     return evidences
 
 
-def _differences(
-    judged: JudgedTable, own: Sequence[Sequence[Term]], other: Sequence[Sequence[Term]]
-) -> list[Evidence]:
-    """The evidence about one method less another in every cell, by the seeds of both."""
-    seeds = _common_seeds([*own, *other])
-    pairs = zip(_evidences(judged, own, seeds), _evidences(judged, other, seeds), strict=True)
-    return [combine((1.0, -1.0), pair) for pair in pairs]
-
-
 def _lines(
-    start: dict[str, Any], design: Design, cells: Sequence[Evidence]
+    start: dict[str, Any], design: Design, cells: Sequence[Evidence], *, is_declared: bool
 ) -> list[dict[str, Any]]:
     """The mean of all cells, then every effect; p-values are corrected within each family."""
     part = start["part"]
@@ -137,7 +139,7 @@ def _lines(
                 "high": math.nan if interval is None else interval.high,
                 "p": math.nan if interval is None else estimate.p,
                 "p_holm": estimate.p_corrected,
-                "shown": ABSENT if is_plain_mean else _word(estimate),
+                "shown": ABSENT if is_plain_mean else _word(estimate, is_declared=is_declared),
                 "error_seeds": trainings.error if trainings else math.nan,
                 "error_images": evidence.error,
                 "seeds": estimate.seeds,
@@ -147,7 +149,9 @@ def _lines(
     return lines
 
 
-def _word(estimate: Estimate) -> str:
+def _word(estimate: Estimate, *, is_declared: bool) -> str:
+    if not is_declared:
+        return EXPLORED
     if estimate.both is None:
         return "2 seeds needed" if estimate.seeds < 2 else "too few images"
     if not estimate.is_shown():

@@ -16,7 +16,7 @@ from statistics import fmean
 from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.same_images import Alike
-from analysis.uncertainty.verdicts import Rule, Verdict, decide
+from analysis.uncertainty.verdicts import Verdict, decide
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.runs.result import RunResult
@@ -28,10 +28,13 @@ from sweeps.judge.contrasts import (
     contrasts_of,
     difference,
     effects_claimed,
+    is_level,
     printed_values,
 )
+from sweeps.judge.judged_claim import Judged, JudgedClaim, are_of_paper
+from sweeps.judge.seeds import CONFIRMING, EXPLORING, of_declared, of_others, scores_of
 from sweeps.plan.claim import HIGHER, LOWER, Claim
-from sweeps.plan.request import UNTIL_DECIDED, RowSeed, TableRequest
+from sweeps.plan.request import RowSeed, TableRequest
 from sweeps.plan.table import Column, is_counted, metric_of, words_of, world_words
 from sweeps.point import Outcome
 from sweeps.score.cells import CellId, ScoredTable, TableCell, score, size_marks
@@ -40,44 +43,8 @@ from sweeps.score.reader import RunReader
 # Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000
 
-
-@dataclass(frozen=True, kw_only=True)
-class JudgedClaim:
-    """A claim with its verdict, and what the verdict is about.
-
-    Attributes:
-        table: its name, e.g. "spatialseg/table3".
-        contrast: the one whose numbers the verdict shows; of a mean, the claim itself.
-        printed: the same contrast of the printed values; None where one is missing.
-        as_printed: whether the printed values agree with the claim; None: some are missing.
-        verdict: None where no contrast could be computed.
-        missing: labels of rows without a finished run, in the order of the table.
-        complete: whether every contrast of it could be computed.
-        reason: why there is no verdict, or why it is undecided; one sentence, or "".
-        images: "synthetic", "real" or "unknown"; of several kinds of runs all kinds; "": no runs.
-        scale: of the runs, in the same way.
-        starts: number of different initial weights of the runs.
-        warnings: rows of different lists; rows of one seed that were trained on different machines.
-    """
-
-    table: str
-    claim: Claim
-    contrast: str
-    printed: float | None = None
-    as_printed: bool | None = None
-    verdict: Verdict | None = None
-    missing: tuple[str, ...] = ()
-    complete: bool = False
-    reason: str = ""
-    images: str = ""
-    scale: str = ""
-    starts: int = 0
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def word(self) -> str:
-        """The kind of the verdict: "holds", "contradicted", "undecided"; or "not run"."""
-        return "not run" if self.verdict is None else self.verdict.kind
+# Of a contrast, the evidence of seeds that were not declared, and that of the declared ones.
+BothSeeds = tuple[Evidence | None, Evidence | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,21 +85,14 @@ class JudgedTable:
     @cached_property
     def claims(self) -> list[JudgedClaim]:
         """Every claim of the table, judged by the finished runs."""
-        return [self._judge(claim) for claim in self.request.table.claims]
-
-    @cached_property
-    def rule(self) -> Rule:
-        """When a claim is decided: a rule valid at any time where results decided how many runs.
-
-        The tag of any table counts, because tables share runs.
-        """
-        if self.request.until_decided:
-            return Rule(any_time=True)
-        for outcome in self.runs.values():
-            for run in outcome.results:
-                if any(name.startswith(UNTIL_DECIDED) for name in run.tags):
-                    return Rule(any_time=True)
-        return Rule()
+        judged: list[JudgedClaim] = []
+        for claim in self.request.table.claims:
+            found = self._judge(claim)
+            for earlier in judged:
+                if found.compared and found.compared == earlier.compared and not earlier.same_as:
+                    found = replace(found, same_as=earlier.claim.name)
+            judged.append(found)
+        return judged
 
     def resampler(self, alike: Alike = "labels") -> Resampler:
         """Return the engine for images with equal labels, or "names" for the worlds of a design.
@@ -196,7 +156,7 @@ class JudgedTable:
         return runs
 
     def _judge(self, claim: Claim) -> JudgedClaim:
-        """Judge one claim; a contrast without scores leaves a claim about all of them undecided."""
+        """Judge one claim by the declared seeds, and by all others."""
         table = self.request.table
         contrasts = contrasts_of(claim, table)
         if claim.effect:
@@ -210,10 +170,11 @@ class JudgedTable:
         judged = JudgedClaim(
             table=self.request.name,
             claim=claim,
-            contrast=contrasts[0].label,
+            label=contrasts[0].label,
             printed=printed[0],
             as_printed=as_claimed(claim, printed),
             missing=tuple(label for label, runs in finished.items() if not runs),
+            is_level=any(is_level(contrast, table) for contrast in contrasts),
         )
 
         # Sizes of networks are counted, not estimated.
@@ -222,60 +183,120 @@ class JudgedTable:
         is_so = as_claimed(claim, exact)
         if is_so is not None:
             verdict = _exact_verdict(exact[0] or 0.0, is_so=is_so)
-            return replace(judged, verdict=verdict, complete=True)
+            return replace(judged, exploration=verdict, complete=True)
 
-        is_mean = claim.combine == "mean"
-        if is_mean:
-            judged = replace(judged, printed=_mean(printed))
-        groups = [contrasts] if is_mean else [[contrast] for contrast in contrasts]
-        alike: Alike = "names" if claim.effect else "labels"
-        evidences: dict[int, Evidence] = {}
-        reasons: list[str] = []
-        for place, group in enumerate(groups):
-            try:
-                evidences[place] = self._evidence(group, alike)
-            except InputError as error:
-                reasons.append(str(error))
-        if not evidences:
-            return replace(judged, reason=reasons[0])
-        runs = [run for runs in finished.values() for run in runs.values()]
+        runs = [run for of_row in finished.values() for run in of_row.values()]
         origins = [self.reader.origin(run) for run in runs]
-        starts = len({origin.start for origin in origins})
-        verdict = decide(
-            list(evidences.values()),
-            claim.range,
-            self.rule,
-            claim.combine,
-            starts=starts,
-            missing=f"Some rows have no score: {reasons[0]}" if reasons else "",
-        )
-        shown = list(evidences)[verdict.decisive]
-        if is_mean:
-            judged = replace(judged, contrast=f"mean of {len(contrasts)} contrasts")
-        else:
-            judged = replace(judged, contrast=contrasts[shown].label, printed=printed[shown])
-        return replace(
+        images = " and ".join(sorted({origin.images for origin in origins}))
+        scale = " and ".join(sorted({origin.scale for origin in origins}))
+        is_changed = bool(self.request.deciding_words())
+        judged = replace(
             judged,
-            verdict=verdict,
-            complete=not reasons,
-            reason=verdict.reason,
-            images=" and ".join(sorted({origin.images for origin in origins})),
-            scale=" and ".join(sorted({origin.scale for origin in origins})),
-            starts=starts,
+            images=images,
+            scale=scale,
+            of_paper=are_of_paper(images, scale, is_changed=is_changed),
+            starts=len({origin.start for origin in origins}),
             warnings=self._warnings(finished),
         )
+        groups = [contrasts] if claim.combine == "mean" else [[one] for one in contrasts]
+        return self._with_verdicts(judged, groups)
 
-    def _evidence(self, contrasts: Sequence[Contrast], alike: Alike) -> Evidence:
-        """The evidence about the mean of contrasts; InputError: `terms`, or rows of equal runs."""
-        terms = []
-        for contrast in contrasts:
+    def _with_verdicts(
+        self, judged: JudgedClaim, groups: Sequence[Sequence[Contrast]]
+    ) -> JudgedClaim:
+        """Add what the runs show about the mean of each group, and about the claim.
+
+        A contrast without scores leaves a claim about all of them open.
+        """
+        singles: list[Judged] = []
+        evidences: list[BothSeeds] = []
+        reasons, same = [], []
+        for group in groups:
+            try:
+                single, terms = self._contrast(judged.claim, group)
+            except InputError as error:
+                reasons.append(str(error))
+                continue
+            if single.scores in [other.scores for other in singles]:
+                same.append(single.label)
+                continue
+            found, reason = self._evidences(judged.claim, terms)
+            explored, confirmed = self._verdicts(judged, [found])
+            singles.append(replace(single, exploration=explored, confirmation=confirmed))
+            evidences.append(found)
+            if reason:
+                reasons.append(reason)
+        if not singles:
+            return replace(judged, reason=reasons[0])
+        if same:
+            warning = f"The same runs as another contrast, judged once: {'; '.join(same)}."
+            judged = replace(judged, warnings=(*judged.warnings, warning))
+        missing = f"Some rows have no score: {reasons[0]}" if reasons else ""
+        explored, confirmed = self._verdicts(judged, evidences, missing)
+        if len(singles) + len(same) < len(groups):
+            confirmed = None
+        judged = replace(
+            judged,
+            exploration=explored,
+            confirmation=confirmed,
+            contrasts=tuple(singles),
+            reason=reasons[0] if reasons else "",
+            complete=not reasons,
+        )
+        verdict = judged.verdict
+        if verdict is None:
+            return judged
+        basis = 1 if judged.confirmation else 0
+        used = [one for one, found in zip(singles, evidences, strict=True) if found[basis]]
+        shown = used[verdict.decisive]
+        return replace(judged, label=shown.label, printed=shown.printed, reason=verdict.reason)
+
+    def _verdicts(
+        self, judged: JudgedClaim, evidences: Sequence[BothSeeds], missing: str = ""
+    ) -> tuple[Verdict | None, Verdict | None]:
+        """Decide by the other seeds at any time, and by the declared ones if all rows have them."""
+        claim, starts = judged.claim, judged.starts
+        wanted = claim.range if judged.of_paper else claim.direction
+        explored = [evidence for evidence, _ in evidences if evidence is not None]
+        confirmed = [evidence for _, evidence in evidences if evidence is not None]
+        exploration = confirmation = None
+        if explored:
+            exploration = decide(
+                explored, wanted, EXPLORING, claim.combine, starts=starts, missing=missing
+            )
+        if len(confirmed) == len(evidences):
+            confirmation = decide(
+                confirmed, wanted, CONFIRMING, claim.combine, starts=judged.starts
+            )
+        return exploration, confirmation
+
+    def _contrast(self, claim: Claim, group: Sequence[Contrast]) -> tuple[Judged, list[Term]]:
+        """The mean of contrasts beside the printed one; InputError: `terms`, or equal runs."""
+        terms: list[Term] = []
+        for contrast in group:
             of_contrast = self.terms(contrast.cells)
-            if _are_same(of_contrast):
+            if not scores_of(of_contrast):
                 rows = " and ".join(dict.fromkeys(f"'{cell.row}'" for cell in contrast.cells))
                 raise InputError(f"rows {rows} are the same runs at this scale.")
             for term in of_contrast:
-                terms.append(replace(term, weight=term.weight / len(contrasts)))
-        return self.resampler(alike).evidence(terms)
+                terms.append(replace(term, weight=term.weight / len(group)))
+        values = printed_values(self.request.table)
+        label = group[0].label if len(group) == 1 else f"mean of {len(group)} contrasts"
+        # Claims that A is above B and that B is below A are one.
+        sign = -1.0 if claim.expected == "lower" else 1.0
+        printed = _mean([contrast.of_values(values) for contrast in group])
+        return Judged(label=label, printed=printed, scores=scores_of(terms, sign)), terms
+
+    def _evidences(self, claim: Claim, terms: Sequence[Term]) -> tuple[BothSeeds, str]:
+        """The evidence of the other seeds and of the declared ones; why the first is missing."""
+        declared = () if claim.exploratory else self.request.table.confirm
+        resampler = self.resampler("names" if claim.effect else "labels")
+        fixed = of_declared(terms, declared)
+        confirmed = resampler.evidence(fixed) if fixed else None
+        try:
+            return (resampler.evidence(of_others(terms, declared)), confirmed), ""
+        except InputError as error:
+            return (None, confirmed), str(error)
 
     def _warnings(self, rows: Mapping[str, Mapping[int, RunResult]]) -> tuple[str, ...]:
         """What differs between runs that are compared: their lists, and the machines of a seed."""
@@ -341,24 +362,20 @@ class JudgedTable:
         for label in sorted(others, key=lambda other: abs(means[other] - means[best])):
             try:
                 terms = self.terms(difference(best, label, column.name).cells)
-                if _are_same(terms):
+                if not scores_of(terms):
                     same.append(label)
                     continue
-                evidence = self.resampler().evidence(terms)
+                fixed = of_declared(terms, self.request.table.confirm)
+                used = fixed or of_others(terms, self.request.table.confirm)
+                evidence = self.resampler().evidence(used)
             except InputError:
                 return []
-            if decide([evidence], wanted, self.rule, "all").kind != "holds":
+            if (
+                decide([evidence], wanted, CONFIRMING if fixed else EXPLORING, "all").kind
+                != "holds"
+            ):
                 return []
         return same if len(same) < len(means) else []
-
-
-def _are_same(terms: Sequence[Term]) -> bool:
-    """Whether a sum of scores is one of the same scores of the same runs, and so is nothing."""
-    sums: dict[tuple[str, ...], float] = {}
-    for term in terms:
-        source = (term.metric, *term.keys.values())
-        sums[source] = sums.get(source, 0.0) + term.weight
-    return not any(sums.values())
 
 
 def _exact_verdict(value: float, *, is_so: bool) -> Verdict:

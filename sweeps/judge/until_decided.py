@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count, islice
 
 from sweeps.judge.contrasts import contrasts_of
-from sweeps.judge.judged_table import JudgedClaim, JudgedTable
+from sweeps.judge.judged_claim import JudgedClaim
+from sweeps.judge.judged_table import JudgedTable
 from sweeps.plan.request import RowSeed
 from sweeps.point import Outcome, Point
 
@@ -29,7 +31,7 @@ class SeedsUntilDecided:
 
     Attributes:
         judged: the table, without runs.
-        max_seeds: most seeds of a row.
+        max_seeds: most seeds of a row, beside those that the table declares.
         external: runs of rows that are not trained.
     """
 
@@ -75,7 +77,8 @@ class SeedsUntilDecided:
                 unfinished.add(seed)
         if len(unfinished) > 1:
             return []
-        for seed in range(self.max_seeds):
+        explored = (seed for seed in count() if seed not in request.table.confirm)
+        for seed in islice(explored, self.max_seeds):
             lacking = [(label, seed) for label in labels if (label, seed) not in runs]
             if lacking:
                 return lacking
@@ -89,8 +92,9 @@ def _is_open(judged: JudgedClaim) -> bool:
     estimate of `HOPELESS` seeds says that no affordable number of seeds decides it. To stop for
     such a reason cannot make a verdict wrong.
     """
-    verdict = judged.verdict
-    if verdict is None or judged.word != "undecided" or not judged.complete:
+    verdict = judged.exploration
+    is_open = not judged.is_level or judged.of_paper
+    if verdict is None or verdict.kind != "undecided" or not (judged.complete and is_open):
         return False
     if verdict.seeds >= START and verdict.interval is None:
         return False

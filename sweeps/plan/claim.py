@@ -55,7 +55,7 @@ class Claim(Strict):
         effect: letters of the factors of the table's design; the claim is then about that effect
             on the outcomes `columns`, by the methods `rows`.
         part: of an effect, "trained" or "tested"; default: tested, if the design has that.
-        exploratory: made after a result was seen, so that the seeds of `Table.confirm` do not judge it.
+        exploratory: made after a result was seen: the seeds of `Table.confirm` do not judge it.
         combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
@@ -78,8 +78,19 @@ class Claim(Strict):
     remarks: tuple[str, ...] = ()
 
     @property
+    def direction(self) -> Range:
+        """Open range of a contrast in the direction that is claimed.
+
+        The margin of "alike", or of "not worse by more than", belongs to the direction. Other
+        bounds are of the size, see `range`.
+        """
+        if self.expected == "similar" or self.at_least < 0:
+            return self.range
+        return HIGHER if self.expected == "higher" else LOWER
+
+    @property
     def range(self) -> Range:
-        """Open range of a contrast that is as expected."""
+        """Open range of a contrast that is as claimed, its size too."""
         most = math.inf if self.at_most is None else self.at_most
         if self.expected == "similar":
             return -most, most

@@ -44,10 +44,6 @@ TAG_LENGTH = 5000
 # words that were typed for all rows; without words, the paper's form has none.
 REQUESTED = "rgbt.requested/"
 
-# Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
-# their table must be valid at any time.
-UNTIL_DECIDED = "rgbt.until_decided/"
-
 # Nodes of the configuration that no override may change.
 ROW_SETTINGS = {
     "seed": "the rows set it; choose seeds=3.",
@@ -80,7 +76,7 @@ class TableRequest:
         pretrained: files of initial weights by the name of the network.
         external: rows that are evaluated and not trained.
         chosen: options that make it another table, as they were typed: rows=..., form=both.
-        until_decided: whether seeds are added until claims are decided, which runs record.
+        until_decided: whether seeds are added until claims are decided.
         digests: of the settings of the rows without `extra` and `pretrained`, by label.
     """
 
@@ -134,8 +130,6 @@ class TableRequest:
     def tags(self, labels: Sequence[str]) -> dict[str, str]:
         """Return the MLflow tags of the run of the rows `labels`: what requested it, and how."""
         tags = {TAG + self.name: " | ".join(labels)[:TAG_LENGTH]}
-        if self.until_decided:
-            tags[UNTIL_DECIDED + self.name] = "true"
         words = self.deciding_words()
         if words or self.form != "paper":
             how = [self.form, self.digests.get(labels[0], ""), *words]
@@ -170,6 +164,11 @@ class TableRequest:
         """Return the overrides of all rows, as they were typed."""
         files = (f"{PRETRAINED}{model}={file}" for model, file in self.pretrained.items())
         return (*self.extra, *files)
+
+    @property
+    def is_confirming(self) -> bool:
+        """Whether its seeds are those that the table declares."""
+        return bool(self.seeds) and self.seeds == self.table.confirm
 
     def deciding_words(self) -> list[str]:
         """Return the words typed for all rows that are of the runs, and not of the machine."""
@@ -372,7 +371,7 @@ def seeds_of(text: str) -> tuple[int, ...]:
             return seeds
     raise InputError(
         f"seeds={text}: expected a number (3: seeds 0, 1, 2), a list of different seeds (0,4,7), "
-        "or until_decided."
+        "confirm, or until_decided."
     )
 
 

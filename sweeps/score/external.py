@@ -35,6 +35,7 @@ from sweeps.plan.request import ExternalRow, RowSeed, TableRequest, row_named
 from sweeps.plan.table import Row, Table, is_counted, words_of
 from sweeps.point import Outcome, Point
 from sweeps.run.local import run_command
+from sweeps.score.reader import EXTERNAL
 
 FOLDER = "external"  # inside the folder of runs
 NODE_FILE = "of_the_table"  # file of conf/dataset and conf/metric, for the commands
@@ -109,6 +110,7 @@ class ExternalRun:
             "dataset": [fingerprint, {**plain["dataset"], "root": None}],
             "metric": plain["metric"],
             "evaluated": [given.kind, *kept],
+            "scale": "paper" if row.network and given.kind == "weights" else request.scale,
         }
         text = json.dumps(description, sort_keys=True, indent=1)
         folder = runs_dir.absolute() / FOLDER / hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -116,7 +118,7 @@ class ExternalRun:
             file = folder / "conf" / group / f"{NODE_FILE}.yaml"
             file.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(file, OmegaConf.to_yaml(OmegaConf.create(plain[group])).encode())
-        write_atomic(folder / "external.json", text.encode())
+        write_atomic(folder / EXTERNAL, text.encode())
         write_json(folder / "provenance.json", {"processes": [{**code(), "diff": None}]})
         return cls(given, row, config, arguments, folder)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -12,6 +13,8 @@ from rgbt.runs.run_spec import RunSpec
 from sweeps.plan.measurement import Words, counts_of, stored_at
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+EXTERNAL = "external.json"  # what the counts of a row that is not trained here depend on
+SYNTHETIC, REAL = "synthetic scenes", "real images"
 
 # Errors that the tags of a run may raise that somebody has edited.
 ODD = (InputError, KeyError, ValueError, TypeError)
@@ -21,7 +24,8 @@ class Origin(NamedTuple):
     """What a run was made of.
 
     Attributes:
-        images: "synthetic", "real" or "unknown".
+        images: "synthetic scenes", "real images of mfnet" (the name of their data set) or "unknown
+            images".
         start: equal for runs that began from the same weights.
         lists: which lists it was trained and selected on, in words, or "".
         machine: graphics card or processor, or "" where it was not recorded.
@@ -91,15 +95,25 @@ class RunReader:
 
 
 def _origin_of(run: RunResult) -> Origin:
+    described = run.folder / EXTERNAL
+    if described.is_file():  # a row that was evaluated and not trained here
+        node = json.loads(described.read_text())
+        images, start = _images_of(node["dataset"][1]), run.key
+        return Origin(images, str(node["scale"]), start, run.lists, run.machine)
     if not (run.folder / "config.yaml").is_file():
-        return Origin("unknown", "unknown", run.key, run.lists, run.machine)
+        return Origin("unknown images", "unknown", run.key, run.lists, run.machine)
     settings = run.settings
     scale = str(settings["scale"]["name"])
-    images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
     weights = str(settings.get("pretrained") or settings["model"].get("weights") or "")
     if weights.startswith("common:"):
         is_one = settings["seeds"]["start"] == "common"
     else:  # a file is the same for all seeds, an upstream run is one of its seed
         is_one = bool(weights) and not weights.startswith("experiment:")
     start = "0" if is_one else str(settings["seed"])
-    return Origin(images, scale, start, run.lists, run.machine)
+    return Origin(_images_of(settings["dataset"]), scale, start, run.lists, run.machine)
+
+
+def _images_of(dataset: Mapping[str, Any]) -> str:
+    if ".synth" in str(dataset["_target_"]):
+        return SYNTHETIC
+    return f"{REAL} of {dataset['name']}"

@@ -8,28 +8,31 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.uncertainty.verdicts import Verdict
 from rgbt.tables import ABSENT, TextTable, csv_text
-from sweeps.judge.judged_table import JudgedClaim
+from sweeps.judge.judged_claim import JUDGED_ONCE, NOT_COMPARABLE, NOT_RUN, WORDS, JudgedClaim
 from sweeps.show.table import plain
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WORDS = ("holds", "contradicted", "undecided", "not run")
 NOTES = (
-    "ours: mean over paired seeds, and its 95 % interval over images and seeds, of one seed over "
-    "images alone. would decide: what is needed for a difference as large as ours.",
-    "A verdict is about the direction and the bounds of a claim, not about a size in its words. "
-    "Each interval holds the truth in 95 % of cases by itself; of many claims without an effect, "
-    "2.5 % are called holding. With seeds far from normal (lognormal, sd 1 of the logarithm) 14 to "
-    "18 % of verdicts about no difference are wrong.",
+    "same direction, opposite direction: the whole 95 % interval is on one side of 0. holds, "
+    "contradicted: so on the paper's images with its recipe. confirmation: by the seeds that "
+    "the table declared before they were run. exploration: by all others, whose number may depend "
+    "on results, so that the interval is valid for any number of them, and wider.",
+    "ours: mean over paired seeds, and its interval over images and seeds, of one seed over images "
+    "alone. size: our interval beside the printed difference. would decide: what is needed for a "
+    "difference as large as ours.",
 )
+AS_CLAIMED, OTHERWISE = ("holds", "same direction"), ("contradicted", "opposite direction")
+OPEN = ("undecided", "not shown")
 # Word in the column of seeds for a difference of two evaluations without seeds.
 IMAGES = "images alone"
 
-COLUMNS = ["table", "paper", "claim", "source", "says", "remarks", "verdict", "contrast"]
-COLUMNS += ["printed", "as_printed", "margin", "missing", "reason", "how", "estimate", "low"]
-COLUMNS += ["high", "smallest", "seeds_needed", "seeds", "starts", "covers", "warning", "images"]
-COLUMNS += ["scale", "start"]
+COLUMNS = ["table", "paper", "claim", "source", "says", "remarks", "verdict", "basis", "contrast"]
+COLUMNS += ["printed", "as_printed", "size", "margin", "missing", "reason", "how", "estimate"]
+COLUMNS += ["low", "high", "smallest", "seeds_needed", "seeds", "starts", "covers", "warning"]
+COLUMNS += ["images", "scale", "start", "same_as", "explored", "explored_low", "explored_high"]
+COLUMNS += ["explored_seeds"]
 # Claims that differ in one of these are never in one grid.
 BASIS = ["images", "scale", "start", "how"]
 
@@ -50,11 +53,12 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
     """Return one claim a row; `how` names the form and overrides of all rows.
 
     Returns:
-        the columns `COLUMNS`. as_printed is True, False or None (not printed), margin that of "does
-        as well as" (NaN of others), start and starts say from how many initial weights the seeds
-        began, warning also says whether lists or machines of the rows differ, and estimate to
-        seeds_needed, seeds and covers are those of `analysis.uncertainty.verdicts.Verdict`; NaN, 0
-        and "" without a verdict.
+        the columns `COLUMNS`. verdict, basis and size are those of `JudgedClaim`, as_printed is
+        True, False or None (not printed), margin that of "does as well as" (NaN of others), start
+        and starts say from how many initial weights the seeds began, warning also says whether
+        lists or machines of the rows differ, and estimate to seeds_needed, seeds and covers are
+        those of `analysis.uncertainty.verdicts.Verdict`; NaN, 0 and "" without a verdict. explored
+        to explored_seeds: what was explored, beside a confirmation too.
     """
     import pandas as pd
 
@@ -64,6 +68,7 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
 
 def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
     claim, verdict = judged.claim, judged.verdict or NO_VERDICT
+    explored = judged.exploration or NO_VERDICT
     is_similar = claim.expected == "similar" and claim.at_most is not None
     start = ""
     if judged.scale:
@@ -78,15 +83,17 @@ def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
         "says": claim.says,
         "remarks": claim.remarks,
         "verdict": judged.word,
-        "contrast": judged.contrast,
+        "basis": judged.basis or "",
+        "contrast": judged.label,
         "printed": math.nan if judged.printed is None else judged.printed,
         "as_printed": judged.as_printed,
+        "size": judged.size,
         "margin": claim.at_most if is_similar else math.nan,
         "missing": " | ".join(judged.missing),
         "reason": judged.reason,
         "estimate": verdict.estimate,
-        "low": math.nan if verdict.interval is None else verdict.interval.low,
-        "high": math.nan if verdict.interval is None else verdict.interval.high,
+        "low": _ends(verdict)[0],
+        "high": _ends(verdict)[1],
         "smallest": verdict.smallest,
         "seeds_needed": verdict.seeds_needed,
         "seeds": verdict.seeds,
@@ -96,7 +103,17 @@ def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
         "images": judged.images,
         "scale": judged.scale,
         "start": start,
+        "same_as": judged.same_as,
+        "explored": explored.estimate,
+        "explored_low": _ends(explored)[0],
+        "explored_high": _ends(explored)[1],
+        "explored_seeds": explored.seeds,
     }
+
+
+def _ends(verdict: Verdict) -> tuple[float, float]:
+    found = verdict.interval
+    return (math.nan, math.nan) if found is None else (found.low, found.high)
 
 
 def counted(frame: pd.DataFrame) -> str:
@@ -107,23 +124,45 @@ def counted(frame: pd.DataFrame) -> str:
         if word in counts:
             shown = "hold" if word == "holds" and counts[word] > 1 else word
             parts.append(f"{counts[word]} {shown}")
-    return f"{len(frame)} claims: {', '.join(parts)}." if parts else "The table has no claims."
+    if not parts:
+        return "The table has no claims."
+    noun = "claim" if len(frame) == 1 else "claims"
+    confirmed = int((frame["basis"] == "confirmation").sum())
+    return f"{len(frame)} {noun}: {', '.join(parts)}; {confirmed} by declared seeds."
 
 
 def counts_grid(frame: pd.DataFrame) -> TextTable:
     """Count the claims of every paper by verdict, and those with which its printed values agree."""
+    used = [word for word in WORDS if (frame["verdict"] == word).any()]
     rows = []
     for paper, claims in frame.groupby("paper", sort=True):
-        verdicts = [str((claims["verdict"] == word).sum()) for word in WORDS]
+        verdicts = [str((claims["verdict"] == word).sum()) for word in used]
+        confirmed = str((claims["basis"] == "confirmation").sum())
         agreeing = sum(value is True for value in claims["as_printed"])
         printed = sum(value is not None for value in claims["as_printed"])
-        rows.append((str(paper), *verdicts, f"{agreeing} of {printed}"))
-    return TextTable("", ("paper", *WORDS, "agree as printed"), tuple(rows))
+        rows.append((str(paper), *verdicts, confirmed, f"{agreeing} of {printed}"))
+    header = ("paper", *used, "by declared seeds", "agree as printed")
+    return TextTable("", header, tuple(rows))
+
+
+def chance_of(frame: pd.DataFrame) -> str:
+    """Say how many of these verdicts chance alone would make, in both directions."""
+    is_judged = frame["basis"].isin(("confirmation", "exploration"))
+    is_left_out = frame["verdict"].isin((NOT_COMPARABLE, JUDGED_ONCE))
+    judged = int((is_judged & ~is_left_out).sum())
+    if not judged:
+        return ""
+    words = frame.loc[is_judged, "verdict"]
+    same, opposite = (int(words.isin(pair).sum()) for pair in (AS_CLAIMED, OTHERWISE))
+    return (
+        f"Of {judged} claims judged at 5 %, chance alone would show up to {0.025 * judged:.1f} in "
+        f"the claimed direction and as many in the opposite one; {same} and {opposite} are shown."
+    )
 
 
 def basis_of(images: str, scale: str, start: str, how: str) -> str:
-    """Say what verdicts rest on: "synthetic images, scale=bench, a start for each seed"."""
-    return ", ".join(part for part in (f"{images} images", f"scale={scale}", start, how) if part)
+    """Say what verdicts rest on: "synthetic scenes, scale=bench, a start for each seed"."""
+    return ", ".join(part for part in (images, f"scale={scale}", start, how) if part)
 
 
 def claim_grids(frame: pd.DataFrame, *, noted: bool = False) -> list[TextTable]:
@@ -132,13 +171,13 @@ def claim_grids(frame: pd.DataFrame, *, noted: bool = False) -> list[TextTable]:
     Those that are decided come first. `noted`: with what the columns and a verdict mean.
     """
     order = frame["verdict"].map(WORDS.index).sort_values(kind="stable").index
-    header = ("verdict", "claim", "ours", "printed", "seeds", "would decide")
+    header = ("verdict", "claim", "ours", "printed", "size", "seeds", "would decide")
     grids = []
     for basis, claims in frame.loc[order].groupby(BASIS, sort=False):
         is_run = bool(basis[1])
         title = counted(claims)
         if is_run:
-            title += f" {basis_of(*basis).capitalize()}."
+            title += f" On {basis_of(*basis)}."
         rows = [_grid_row(row) for _, row in claims.iterrows()]
         notes = [warning for warning in claims["warning"].unique() if warning]
         if noted and is_run:
@@ -157,6 +196,7 @@ def _grid_row(row: pd.Series) -> tuple[str, ...]:
         f"{row['says']} ({table}: {row['contrast']})",
         ours,
         _signed(row["printed"]),
+        row["size"] or ABSENT,
         _seeds(row),
         _would_decide(row),
     )
@@ -168,14 +208,16 @@ def _interval(row: pd.Series) -> str:
 
 
 def _seeds(row: pd.Series) -> str:
-    """The number of paired seeds, or that there are none."""
-    return IMAGES if row["covers"] == "images" and not row["seeds"] else str(row["seeds"])
+    """The number of paired seeds and what they are for, or that there are none."""
+    if row["basis"] == "evaluation":
+        return IMAGES
+    return f"{row['seeds']} ({row['basis']})" if row["seeds"] else str(row["seeds"])
 
 
 def _would_decide(row: pd.Series) -> str:
-    """What an undecided claim needs."""
+    """What a claim needs whose direction is open."""
     needed = float(row["seeds_needed"])
-    if row["verdict"] != "undecided":
+    if row["verdict"] not in OPEN:
         return ABSENT
     if row["missing"]:
         return "more rows"
@@ -189,15 +231,25 @@ def _signed(value: float) -> str:
 
 
 def statement(row: pd.Series) -> str:
-    """Return a claim with its verdict, its numbers and what these rest on, as Markdown."""
-    if row["verdict"] == "not run":
+    """Return a claim with its two answers and what these rest on, as Markdown, on one line."""
+    word = row["verdict"]
+    if word == NOT_RUN:
         return f"{row['says']} **Not run.**"
-    text = f"{row['says']} **{row['verdict'].capitalize()}**: {row['contrast']} "
+    if word == NOT_COMPARABLE:
+        where = f"these are of {row['images']}"
+        return f"{row['says']} **Not comparable**: it is about a level of scores, and {where}."
+    if word == JUDGED_ONCE:
+        return (
+            f"{row['says']} **Judged once**: the runs and scores are those of `{row['same_as']}`."
+        )
+    where = f" on {row['images']}" if row["images"] else ""
+    text = f"{row['says']} **{word.capitalize()}**{where}: {row['contrast']} "
     text += f"{_signed(row['estimate'])} {_interval(row)}"
+    if row["size"]:
+        text += f", printed {_signed(row['printed'])} ({row['size']})"
     if row["scale"]:
         seeds = _seeds(row)
-        seeds = seeds if seeds == IMAGES else f"{seeds} seeds"
-        text += f" ({basis_of(*row[BASIS])}, {seeds})"
+        text += f"; scale={row['scale']}, seeds: {seeds}"
     text += "."
     if not math.isnan(row["margin"]):
         text += f" Alike means within {row['margin']:g}."
@@ -212,18 +264,22 @@ def claim_lines(frame: pd.DataFrame) -> list[str]:
     lines = []
     for _, row in frame.iterrows():
         line = f"- `{row['claim']}`: {statement(row)} ({row['source']})"
-        if row["verdict"] == "not run":
+        if row["verdict"] == NOT_RUN:
             lines.append(line)
             continue
-        line += f" The printed values {words[row['as_printed']]}"
-        if not math.isnan(row["printed"]):
-            line += f" ({row['printed']:+.2f})"
-        line += "."
+        line += f" The printed values {words[row['as_printed']]} with it."
+        if row["basis"] == "confirmation" and not math.isnan(row["explored_low"]):
+            explored = f"{_signed(row['explored'])} {_explored(row)}"
+            line += f" Explored before: {explored}, {row['explored_seeds']} seeds."
         if row["reason"]:
             line += f" {row['reason'][:1].upper()}{row['reason'][1:]}"
         lines.append(line)
         lines += [f"    - {remark}" for remark in row["remarks"]]
     return lines
+
+
+def _explored(row: pd.Series) -> str:
+    return f"[{_signed(row['explored_low'])}, {_signed(row['explored_high'])}]"
 
 
 def claims_markdown(frame: pd.DataFrame) -> str:

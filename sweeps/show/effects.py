@@ -25,7 +25,8 @@ NOTES = (
     "difference: mean at the high level less mean at the low level; of an interaction half of the "
     "difference of two effects. of seeds, of images: standard errors.",
     "shown: differs from 0 at the 5 % level, corrected for the number of main effects, or of "
-    "interactions, of the method (Holm). The intervals are not corrected.",
+    "interactions, of the method (Holm). The intervals are not corrected. explored: by other seeds "
+    "than those that the table declares, which decide.",
 )
 # Part of the height of a row over which the methods are spread.
 SPAN = 0.62

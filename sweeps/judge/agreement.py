@@ -1,0 +1,174 @@
+"""How far runs rank like the printed values: Spearman's correlation by table, signs of contrasts.
+
+It says how far results at a small scale, or on other images, foretell those of a paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from analysis.uncertainty.blocks import Values
+from analysis.uncertainty.verdicts import Verdict
+from rgbt.randomness import numpy_generator
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.judge.seeds import negated
+from sweeps.plan.table import Column
+from sweeps.score.cells import published
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RANKS = ["table", "column", "images", "scale", "rows", "rho", "low", "high"]
+CONTRASTS = ["paper", "table", "contrast", "images", "scale", "printed", "explored", "explored_low"]
+CONTRASTS += ["explored_high", "explored_seeds", "confirmed", "confirmed_low", "confirmed_high"]
+CONTRASTS += ["confirmed_seeds"]
+
+# Rows below which a rank correlation says nothing.
+FEWEST_ROWS = 3
+DRAWS = 4_000
+
+
+class Agreement(NamedTuple):
+    """Of how many contrasts the sign is the printed one.
+
+    `low` and `high` are the ends of the 95 % interval of the share, with tables drawn anew, because
+    the contrasts of a table share rows; NaN for one table. `decided`: those whose interval excludes
+    0, and `decided_alike` of them with the printed sign.
+    """
+
+    images: str
+    scale: str
+    alike: int
+    contrasts: int
+    low: float
+    high: float
+    decided_alike: int
+    decided: int
+
+
+def ranks_of(tables: Sequence[JudgedTable]) -> pd.DataFrame:
+    """Compare our ranking of the rows of tables with the printed one.
+
+    Returns:
+        a row for each table and column of a main score, with the columns `RANKS`: rho is Spearman's
+        correlation of our means with the printed values over rows of different runs; low and high
+        are the ends of a 95 % interval, with our means drawn anew by their spread over seeds (NaN
+        where a row has one seed).
+    """
+    import pandas as pd
+
+    found = []
+    for judged in tables:
+        for column in judged.request.table.headlines():
+            ranked = _ranked(judged, column)
+            if ranked is not None:
+                found.append(ranked)
+    return pd.DataFrame(found, columns=RANKS)
+
+
+def _ranked(judged: JudgedTable, column: Column) -> dict[str, Any] | None:
+    seen: set[tuple[str, ...]] = set()
+    ours, errors, freedoms, printed, kinds = [], [], [], [], set()
+    for row in judged.request.table.rows:
+        cell, value = judged.scored.cells.get((row.label, column.name)), published(row, column)
+        if cell is None or value is None or math.isnan(cell.mean) or cell.keys in seen:
+            continue
+        seen.add(cell.keys)
+        for (label, _), outcome in judged.runs.items():
+            if label == row.label:
+                kinds |= {judged.reader.origin(run)[:2] for run in outcome.results}
+        ours.append(cell.mean)
+        printed.append(value)
+        errors.append(cell.sd / math.sqrt(cell.seeds) if cell.seeds > 1 else math.nan)
+        freedoms.append(max(1, cell.seeds - 1))
+    if len(ours) < FEWEST_ROWS or len(kinds) != 1 or len(set(printed)) < 2:
+        return None
+    ((images, scale),) = kinds
+    low = high = math.nan
+    if not np.isnan(errors).any():
+        rng = numpy_generator(0, "ranks")
+        noise = rng.standard_t(freedoms, (DRAWS, len(ours)))
+        drawn = rank_correlations(np.array(ours) + noise * np.array(errors), np.array(printed))
+        low, high = np.quantile(drawn, [0.025, 0.975])
+    (rho,) = rank_correlations(np.array([ours]), np.array(printed))
+    numbers = (len(ours), rho, low, high)
+    values = (judged.request.name, column.name, images, scale, *numbers)
+    return dict(zip(RANKS, values, strict=True))
+
+
+def rank_correlations(scores: Values, printed: Values) -> Values:
+    """Return Spearman's correlation of each row of `scores` (D, R) with `printed` (R,): (D,)."""
+    from scipy.stats import rankdata
+
+    ranks = rankdata(scores, axis=1)
+    ranks -= ranks.mean(1, keepdims=True)
+    other = rankdata(printed)
+    other -= other.mean()
+    lengths = np.sqrt((ranks**2).sum(1) * (other**2).sum())
+    with np.errstate(invalid="ignore"):
+        return np.asarray(ranks @ other / lengths)
+
+
+def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
+    """Return the contrasts of all claims about differences whose printed values are known.
+
+    Returns:
+        a row for each contrast of different runs, with the columns `CONTRASTS`; NaN and 0 where it
+        was not explored, or not confirmed.
+    """
+    import pandas as pd
+
+    found, seen = [], set[frozenset[Any]]()
+    for judged in tables:
+        for claim in judged.claims:
+            for single in () if claim.is_level else claim.contrasts:
+                if single.printed is None or single.scores in seen:
+                    continue
+                seen |= {single.scores, negated(single.scores)}
+                row = (claim.table.partition("/")[0], claim.table, single.label)
+                numbers = (*_numbers(single.exploration), *_numbers(single.confirmation))
+                found.append((*row, claim.images, claim.scale, single.printed, *numbers))
+    return pd.DataFrame(found, columns=CONTRASTS)
+
+
+def _numbers(verdict: Verdict | None) -> tuple[float, float, float, int]:
+    if verdict is None:
+        return math.nan, math.nan, math.nan, 0
+    ends = (math.nan, math.nan)
+    if verdict.interval is not None:
+        ends = (verdict.interval.low, verdict.interval.high)
+    return verdict.estimate, *ends, verdict.seeds
+
+
+def agreements_of(contrasts: pd.DataFrame) -> list[Agreement]:
+    """Count signs as printed among contrasts (`contrasts_frame`), by kind of images and scale."""
+    found = []
+    for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
+        ours = group["confirmed"].fillna(group["explored"])
+        low = group["confirmed_low"].fillna(group["explored_low"])
+        high = group["confirmed_high"].fillna(group["explored_high"])
+        known = ours.notna() & (group["printed"] != 0)
+        alike = known & (ours * group["printed"] > 0)
+        decided = known & ((low > 0) | (high < 0))
+        if not known.any():
+            continue
+        by_table = alike[known].groupby(group["table"][known])
+        ends = _share_interval(by_table.sum().to_numpy(), by_table.size().to_numpy())
+        counts = (int(alike.sum()), int(known.sum()))
+        of_decided = (int((alike & decided).sum()), int(decided.sum()))
+        found.append(Agreement(str(images), str(scale), *counts, *ends, *of_decided))
+    return found
+
+
+def _share_interval(alike: Values, every: Values) -> tuple[float, float]:
+    """The 95 % interval of a share whose tables, with `alike` of `every` contrasts, are redrawn."""
+    if len(every) < 2:
+        return math.nan, math.nan
+    places = numpy_generator(0, "signs").integers(0, len(every), (DRAWS, len(every)))
+    shares = alike[places].sum(1) / every[places].sum(1)
+    low, high = np.quantile(shares, [0.025, 0.975])
+    return float(low), float(high)
