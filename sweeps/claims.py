@@ -16,7 +16,7 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from sweeps.judge.judged_claim import JudgedClaim
+    from sweeps.judge.judged_table import JudgedTable
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,22 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Print every claim of the papers: holds, contradicted, undecided, or not run.
+    """Print every claim of the papers: its direction and size in finished runs, or not run.
 
+    A claim holds or is contradicted where runs with the paper's recipe on its images show so. Other
+    runs, such as those on synthetic scenes, have the same or the opposite direction. The last lines
+    say how far such runs rank like the printed values.
     Overrides are those of the runs: dataset.root=/data/MFNet. Claims about data sets alone, such as
     those on noise and sharpness, are decided by `rgbt spatial`.
     """
     from rich.console import Group
 
     from rgbt.files.atomic import write_atomic
-    from rgbt.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
+    from sweeps.judge.agreement import agreements_of, contrasts_frame, ranks_of
+    from sweeps.show.agreement import agreement_lines
     from sweeps.show.claims import (
+        chance_of,
         claim_grids,
         claims_frame,
         claims_markdown,
@@ -52,10 +58,13 @@ def main(options: Options, overrides: list[str]) -> int:
         frame_csv,
     )
 
-    frame = claims_frame(judge_all(options, overrides))
+    tables = judge_all(options, overrides)
+    frame = claims_frame([claim for table in tables for claim in table.claims])
     run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
     print_rich(Group(*map(rich_table, [*claim_grids(frame, noted=True), counts_grid(frame)])))
     print_rich(f"{counted(frame)} ({run_as})")
+    lines = agreement_lines(agreements_of(contrasts_frame(tables)), ranks_of(tables))
+    print_rich(plain_text("\n".join(filter(None, [chance_of(frame), *lines]))))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         words = " ".join(word for word in run_as.split() if not word.startswith("dataset.root="))
@@ -67,7 +76,7 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
+def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
     """Judge the claims of the requested tables by the finished runs."""
     from rich.console import Console
     from rich.progress import track
@@ -86,7 +95,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     check_overrides(overrides)
     reader = RunReader(finished_runs(options.runs_dir, options.archive))
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
-    judged: list[JudgedClaim] = []
+    judged: list[JudgedTable] = []
     for name in track(names, "judging", console=Console(stderr=True), transient=True):
         if not load_table(name).claims:
             continue
@@ -100,7 +109,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
             )
         runs = runs_of_request(request, reader, planner, checked=bool(overrides))
         sizes = network_sizes(request)
-        judged += JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader).claims
+        table = JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader)
+        _ = table.claims  # the slow part, while progress is shown
+        judged.append(table)
     return judged
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from analysis.uncertainty.blocks import Values
 from analysis.uncertainty.verdicts import Verdict
 from rgbt.randomness import numpy_generator
+from sweeps.judge.judged_claim import Judged, JudgedClaim
 from sweeps.judge.judged_table import JudgedTable
-from sweeps.judge.seeds import negated
+from sweeps.judge.seeds import Scores, negated
 from sweeps.plan.table import Column
 from sweeps.score.cells import published
 
@@ -23,7 +24,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RANKS = ["table", "column", "images", "scale", "rows", "rho", "low", "high"]
-CONTRASTS = ["paper", "table", "contrast", "images", "scale", "printed", "explored", "explored_low"]
+CONTRASTS = [
+    "paper",
+    "table",
+    "claim",
+    "contrast",
+    "decides",
+    "images",
+    "scale",
+    "printed",
+    "explored",
+    "explored_low",
+]
 CONTRASTS += ["explored_high", "explored_seeds", "confirmed", "confirmed_low", "confirmed_high"]
 CONTRASTS += ["confirmed_seeds"]
 
@@ -117,22 +129,42 @@ def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
     """Return the contrasts of all claims about differences whose printed values are known.
 
     Returns:
-        a row for each contrast of different runs, with the columns `CONTRASTS`; NaN and 0 where it
-        was not explored, or not confirmed.
+        a row for each contrast of different runs, with the columns `CONTRASTS`: decides says
+        whether its numbers are those of the verdict of the claim; NaN and 0 where it was not
+        explored, or not confirmed.
     """
     import pandas as pd
 
-    found, seen = [], set[frozenset[Any]]()
+    rows: dict[Scores, dict[str, Any]] = {}
     for judged in tables:
         for claim in judged.claims:
             for single in () if claim.is_level else claim.contrasts:
-                if single.printed is None or single.scores in seen:
+                if single.printed is None:
                     continue
-                seen |= {single.scores, negated(single.scores)}
-                row = (claim.table.partition("/")[0], claim.table, single.label)
-                numbers = (*_numbers(single.exploration), *_numbers(single.confirmation))
-                found.append((*row, claim.images, claim.scale, single.printed, *numbers))
-    return pd.DataFrame(found, columns=CONTRASTS)
+                decides = single.label == claim.label and not claim.same_as
+                for scores in (single.scores, negated(single.scores)):
+                    if scores in rows:
+                        rows[scores]["decides"] |= decides
+                        break
+                else:
+                    rows[single.scores] = {**_contrast(claim, single), "decides": decides}
+    return pd.DataFrame(list(rows.values()), columns=CONTRASTS)
+
+
+def _contrast(claim: JudgedClaim, single: Judged) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "paper": claim.table.rpartition("/")[0] or "studies",
+        "table": claim.table,
+        "claim": claim.claim.name,
+        "contrast": single.label,
+        "images": claim.images,
+        "scale": claim.scale,
+        "printed": single.printed,
+    }
+    for kind, verdict in (("explored", single.exploration), ("confirmed", single.confirmation)):
+        names = [kind, f"{kind}_low", f"{kind}_high", f"{kind}_seeds"]
+        row |= dict(zip(names, _numbers(verdict), strict=True))
+    return row
 
 
 def _numbers(verdict: Verdict | None) -> tuple[float, float, float, int]:

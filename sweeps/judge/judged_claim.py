@@ -12,7 +12,7 @@ from typing import Literal
 
 from analysis.uncertainty.verdicts import Verdict
 from sweeps.judge.seeds import Scores
-from sweeps.plan.claim import Claim
+from sweeps.plan.claim import Claim, Range
 from sweeps.score.reader import REAL
 
 # Words for the kinds of verdicts: on the paper's images with its recipes, and elsewhere.
@@ -85,7 +85,8 @@ class JudgedClaim(Judged):
         table: its name, e.g. "spatialseg/table3".
         contrasts: those of different runs, in the order of the claim, each judged by itself.
         as_printed: whether the printed values agree with the claim; None: some are missing.
-        missing: labels of rows without a finished run, in the order of the table.
+        rows: labels of the rows that it is about, in the order of the table.
+        missing: those without a finished run.
         complete: whether every contrast of it could be computed.
         reason: why there is no verdict, or why it is open; one sentence, or "".
         images: "synthetic scenes", "real images of mfnet", ...; of several kinds all; "": no runs.
@@ -93,7 +94,6 @@ class JudgedClaim(Judged):
         of_paper: whether the runs are the paper's: scale=paper, real images, no changed setting.
         is_level: whether it is about how high a score is.
         same_as: the claim before it that is about the same runs, "".
-        starts: number of different initial weights of the runs.
         warnings: rows of different lists; rows of one seed that were trained on different machines;
             rows that are the same runs.
     """
@@ -102,6 +102,7 @@ class JudgedClaim(Judged):
     claim: Claim
     contrasts: tuple[Judged, ...] = ()
     as_printed: bool | None = None
+    rows: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     complete: bool = False
     reason: str = ""
@@ -110,8 +111,19 @@ class JudgedClaim(Judged):
     of_paper: bool = False
     is_level: bool = False
     same_as: str = ""
-    starts: int = 0
     warnings: tuple[str, ...] = ()
+
+    @property
+    def wanted(self) -> Range:
+        """Open range of its contrasts: as claimed; not on the paper's images: its direction."""
+        return self.claim.range if self.of_paper else self.claim.direction
+
+    @property
+    def asked(self) -> tuple[Range, str]:
+        """What it asks of `compared`: that A is above B is as much as that B is below A."""
+        low, high = self.wanted
+        is_lower = self.claim.expected == "lower"
+        return ((-high, -low) if is_lower else (low, high)), self.claim.combine
 
     @property
     def compared(self) -> frozenset[Scores]:

@@ -8,13 +8,13 @@ weights and the order of their data.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import fmean
 
 from analysis.uncertainty import Interval, Resampling
-from analysis.uncertainty.contrasts import Evidence, Resampler, Term
+from analysis.uncertainty.contrasts import FIXED, Evidence, Resampler, Term
 from analysis.uncertainty.same_images import Alike
 from analysis.uncertainty.verdicts import Verdict, decide
 from rgbt.checks import InputError
@@ -42,6 +42,8 @@ from sweeps.score.reader import RunReader
 
 # Resamples of the images: enough to know a standard error to 2 %.
 RESAMPLES = 2_000
+
+SOME_SEEDS = "Some rows have no seed but declared ones."
 
 # Of a contrast, the evidence of seeds that were not declared, and that of the declared ones.
 BothSeeds = tuple[Evidence | None, Evidence | None]
@@ -86,11 +88,13 @@ class JudgedTable:
     def claims(self) -> list[JudgedClaim]:
         """Every claim of the table, judged by the finished runs."""
         judged: list[JudgedClaim] = []
+        first: dict[object, str] = {}  # name of the first claim that asks the same of the same runs
         for claim in self.request.table.claims:
             found = self._judge(claim)
-            for earlier in judged:
-                if found.compared and found.compared == earlier.compared and not earlier.same_as:
-                    found = replace(found, same_as=earlier.claim.name)
+            if found.contrasts:
+                asked = (found.compared, found.asked)
+                found = replace(found, same_as=first.get(asked, ""))
+                first.setdefault(asked, claim.name)
             judged.append(found)
         return judged
 
@@ -173,6 +177,7 @@ class JudgedTable:
             label=contrasts[0].label,
             printed=printed[0],
             as_printed=as_claimed(claim, printed),
+            rows=tuple(labels),
             missing=tuple(label for label, runs in finished.items() if not runs),
             is_level=any(is_level(contrast, table) for contrast in contrasts),
         )
@@ -195,7 +200,6 @@ class JudgedTable:
             images=images,
             scale=scale,
             of_paper=are_of_paper(images, scale, is_changed=is_changed),
-            starts=len({origin.start for origin in origins}),
             warnings=self._warnings(finished),
         )
         groups = [contrasts] if claim.combine == "mean" else [[one] for one in contrasts]
@@ -211,11 +215,13 @@ class JudgedTable:
         singles: list[Judged] = []
         evidences: list[BothSeeds] = []
         reasons, same = [], []
+        lost = ""
         for group in groups:
             try:
                 single, terms = self._contrast(judged.claim, group)
             except InputError as error:
                 reasons.append(str(error))
+                lost = lost or f"Some rows have no score: {error}"
                 continue
             if single.scores in [other.scores for other in singles]:
                 same.append(single.label)
@@ -231,9 +237,8 @@ class JudgedTable:
         if same:
             warning = f"The same runs as another contrast, judged once: {'; '.join(same)}."
             judged = replace(judged, warnings=(*judged.warnings, warning))
-        missing = f"Some rows have no score: {reasons[0]}" if reasons else ""
-        explored, confirmed = self._verdicts(judged, evidences, missing)
-        if len(singles) + len(same) < len(groups):
+        explored, confirmed = self._verdicts(judged, evidences, lost)
+        if lost and explored is not None:  # the other seeds may have more rows
             confirmed = None
         judged = replace(
             judged,
@@ -254,21 +259,33 @@ class JudgedTable:
     def _verdicts(
         self, judged: JudgedClaim, evidences: Sequence[BothSeeds], missing: str = ""
     ) -> tuple[Verdict | None, Verdict | None]:
-        """Decide by the other seeds at any time, and by the declared ones if all rows have them."""
-        claim, starts = judged.claim, judged.starts
-        wanted = claim.range if judged.of_paper else claim.direction
-        explored = [evidence for evidence, _ in evidences if evidence is not None]
-        confirmed = [evidence for _, evidence in evidences if evidence is not None]
-        exploration = confirmation = None
-        if explored:
-            exploration = decide(
-                explored, wanted, EXPLORING, claim.combine, starts=starts, missing=missing
-            )
-        if len(confirmed) == len(evidences):
-            confirmation = decide(
-                confirmed, wanted, CONFIRMING, claim.combine, starts=judged.starts
-            )
-        return exploration, confirmation
+        """Decide by the other seeds at any time, and by the declared ones if all rows have them.
+
+        `missing`: why further contrasts of the claim have no evidence, see `decide`.
+        """
+        claim = judged.claim
+        verdicts: list[Verdict | None] = []
+        for rule, place in ((EXPLORING, 0), (CONFIRMING, 1)):
+            found = [one for both in evidences if (one := both[place]) is not None]
+            is_partial = len(found) < len(evidences)
+            if not found or (is_partial and rule is CONFIRMING):
+                verdicts.append(None)
+                continue
+            lost = missing or (SOME_SEEDS if is_partial else "")
+            starts = self._starts(judged, {seed for one in found for seed in one.seeds})
+            verdict = decide(found, judged.wanted, rule, claim.combine, starts=starts, missing=lost)
+            verdicts.append(verdict)
+        explored, confirmed = verdicts
+        return explored, confirmed
+
+    def _starts(self, judged: JudgedClaim, seeds: Collection[int]) -> int:
+        """The number of different initial weights from which these seeds of its rows began."""
+        starts = set()
+        for label in judged.rows:
+            for seed, run in self._finished(label).items():
+                if seed in seeds or seed == FIXED:
+                    starts.add(self.reader.origin(run).start)
+        return len(starts)
 
     def _contrast(self, claim: Claim, group: Sequence[Contrast]) -> tuple[Judged, list[Term]]:
         """The mean of contrasts beside the printed one; InputError: `terms`, or equal runs."""

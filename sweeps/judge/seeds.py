@@ -28,7 +28,8 @@ def of_others(terms: Sequence[Term], declared: Collection[int]) -> list[Term]:
     for term in terms:
         seeds = [seed for seed in term.counts if seed not in declared]
         if not seeds:
-            raise InputError("a row has no seed but declared ones, and not all rows have these.")
+            names = ", ".join(map(str, sorted(declared)))
+            raise InputError(f"not all of the declared seeds {names} are finished.")
         found.append(_with_seeds(term, seeds))
     return found
 

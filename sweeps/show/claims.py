@@ -72,7 +72,7 @@ def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
     is_similar = claim.expected == "similar" and claim.at_most is not None
     start = ""
     if judged.scale:
-        is_one = judged.starts == 1 and verdict.seeds > 1
+        is_one = verdict.starts == 1 and verdict.seeds > 1
         start = "one start for all seeds" if is_one else "a start for each seed"
     warnings = [verdict.warning, *judged.warnings] if verdict.warning else judged.warnings
     return {
@@ -97,7 +97,7 @@ def _columns_of(judged: JudgedClaim) -> dict[str, Any]:
         "smallest": verdict.smallest,
         "seeds_needed": verdict.seeds_needed,
         "seeds": verdict.seeds,
-        "starts": min(verdict.seeds, judged.starts),
+        "starts": min(verdict.seeds, verdict.starts or 0),
         "covers": "" if judged.verdict is None else verdict.covers,
         "warning": " ".join(warnings),
         "images": judged.images,
@@ -231,7 +231,7 @@ def _signed(value: float) -> str:
 
 
 def statement(row: pd.Series) -> str:
-    """Return a claim with its two answers and what these rest on, as Markdown, on one line."""
+    """Return a claim with its direction and size, and what these rest on, as a line of Markdown."""
     word = row["verdict"]
     if word == NOT_RUN:
         return f"{row['says']} **Not run.**"
@@ -243,19 +243,21 @@ def statement(row: pd.Series) -> str:
             f"{row['says']} **Judged once**: the runs and scores are those of `{row['same_as']}`."
         )
     where = f" on {row['images']}" if row["images"] else ""
-    text = f"{row['says']} **{word.capitalize()}**{where}: {row['contrast']} "
+    text = f"{row['says']} **{word.capitalize()}**{where}: "
     text += f"{_signed(row['estimate'])} {_interval(row)}"
     if row["size"]:
         text += f", printed {_signed(row['printed'])} ({row['size']})"
-    if row["scale"]:
-        seeds = _seeds(row)
-        text += f"; scale={row['scale']}, seeds: {seeds}"
-    text += "."
-    if not math.isnan(row["margin"]):
-        text += f" Alike means within {row['margin']:g}."
-    if row["warning"]:
-        text += f" {row['warning']}"
-    return text
+    return f"{text}; {_rests_on(row)}."
+
+
+def _rests_on(row: pd.Series) -> str:
+    """What a verdict rests on, in words."""
+    seeds = "1 seed" if row["seeds"] == 1 else f"{row['seeds']} seeds"
+    if row["basis"] == "confirmation":
+        return f"confirmation by {row['seeds']} declared seeds"
+    if row["basis"] == "exploration":
+        return f"exploration with {seeds}, not confirmed"
+    return "counted" if row["basis"] == "counted" else f"of {IMAGES}"
 
 
 def claim_lines(frame: pd.DataFrame) -> list[str]:
@@ -267,7 +269,12 @@ def claim_lines(frame: pd.DataFrame) -> list[str]:
         if row["verdict"] == NOT_RUN:
             lines.append(line)
             continue
-        line += f" The printed values {words[row['as_printed']]} with it."
+        line += f" The printed values {words[row['as_printed']]}. {row['contrast']}"
+        line += f"; {basis_of(*row[BASIS])}." if row["scale"] else "."
+        if not math.isnan(row["margin"]):
+            line += f" Alike means within {row['margin']:g}."
+        if row["warning"]:
+            line += f" {row['warning']}"
         if row["basis"] == "confirmation" and not math.isnan(row["explored_low"]):
             explored = f"{_signed(row['explored'])} {_explored(row)}"
             line += f" Explored before: {explored}, {row['explored_seeds']} seeds."

@@ -20,10 +20,13 @@ from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
+from sweeps.judge.agreement import agreements_of, contrasts_frame, ranks_of
+from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.stored_tables import judged_tables, known_tables
 from sweeps.plan.planner import Planner
-from sweeps.score.reader import RunReader
-from sweeps.show.claims import counts_grid, statement
+from sweeps.score.reader import SYNTHETIC, RunReader
+from sweeps.show.agreement import agreement_lines, ranks_grid, signs_grid, signs_in_words
+from sweeps.show.claims import chance_of, counts_grid, statement
 from sweeps.show.sections import (
     STUDIES,
     TableSection,
@@ -81,6 +84,9 @@ class Report:
         bar = track(list(judged), "tables", console=Console(stderr=True))
         self.tables = [TableSection(table) for table in bar]
         self.every = claims_of(self.tables)
+        were_run = [section.judged for section in self.tables if section.is_run]
+        self.contrasts, self.ranks = contrasts_frame(were_run), ranks_of(were_run)
+        self.agreement = agreement_lines(agreements_of(self.contrasts), self.ranks)
         self.claims = self._decisive_claims()
         self.data = runs_section(self.runs, self.reader, self.remarks)
         self.papers = self._papers()
@@ -89,10 +95,11 @@ class Report:
             self.studies[path.parent.name] = path.read_text(errors="replace")
 
     def _decisive_claims(self) -> pd.DataFrame:
-        """Every claim once: its verdict by the most seeds at the largest scale counts."""
+        """Every claim once: at the largest scale, by the declared seeds, or by the most seeds."""
         ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
-        ranked = self.every.assign(rank=ranks.fillna(-1))
-        order = ranked.sort_values(["rank", "seeds"], kind="stable")
+        is_sure = self.every["basis"] == "confirmation"
+        ranked = self.every.assign(rank=ranks.fillna(-1), sure=is_sure)
+        order = ranked.sort_values(["rank", "sure", "seeds"], kind="stable")
         return order.drop_duplicates(["table", "claim"], keep="last").sort_index()
 
     def _papers(self) -> list[dict[str, Any]]:
@@ -104,14 +111,14 @@ class Report:
         for table in self.tables:
             known.setdefault(table.page, (table.page, "Tables of the user."))
         return [
-            paper_section(name, title, reference, self.tables)
+            paper_section(name, title, reference, self.tables, self.contrasts)
             for name, (title, reference) in known.items()
         ]
 
     @property
     def limits(self) -> list[str]:
         """What the verdicts do not say, one sentence or two each."""
-        judged = self.every[self.every["verdict"] != "not run"]
+        judged = self.claims[self.claims["verdict"] != NOT_RUN]
         sentences = []
         if "paper" not in set(judged["scale"]):
             sentences.append(
@@ -119,7 +126,12 @@ class Report:
                 "something about a method at that scale, and neither confirm nor refute a number."
             )
         for column, word, text in (
-            ("images", "synthetic", "is on synthetic scenes: what these lack, it cannot show"),
+            ("images", SYNTHETIC, "is on synthetic scenes: what these lack, it cannot show"),
+            (
+                "basis",
+                "exploration",
+                "is by seeds whose number may depend on results, not confirmed",
+            ),
             ("start", "one start for all seeds", "is from one start, see the warning beside it"),
             ("covers", "images", "is of one training: other trainings are not covered"),
         ):
@@ -127,11 +139,11 @@ class Report:
             if count:
                 name = column.capitalize()
                 sentences.append(f"**{name}:** the verdict of {count} claims {text}.")
-        chance = f"**Chance:** of {len(judged)} claims without any effect, up to"
-        return [*sentences, f"{chance} {0.025 * len(judged):.1f} would be called holding."]
+        chance = chance_of(self.claims)
+        return [*sentences, f"**Chance:** {chance}"] if chance else sentences
 
     def page(self, name: str) -> str:
-        """Return a page as Markdown: "index", "claims", "networks", "all" or name of a paper."""
+        """Return a page as Markdown: "index", "claims", "agreement", ..., or name of a paper."""
         environment = Environment(
             loader=FileSystemLoader(TEMPLATES),
             autoescape=False,  # Markdown; `MARKUP` makes plain what looks like an element
@@ -154,10 +166,13 @@ class Report:
             "counts": markdown(counts_grid(self.claims)),
             "papers": self.papers,
             "limits": self.limits,
+            "agreement": self.agreement,
+            "signs": markdown(signs_grid(self.contrasts)),
+            "ranks": markdown(ranks_grid(self.ranks)),
             "own": own,
             "papers_tables": of_papers,
             "studies": self.studies.items(),
-            "any_verdict": bool((self.claims["verdict"] != "not run").any()),
+            "any_verdict": bool((self.claims["verdict"] != NOT_RUN).any()),
         }
         if name == "networks":
             data |= networks_section(self.texts["networks"])
@@ -169,7 +184,13 @@ class Report:
 
     def pages(self) -> dict[str, str]:
         """Return every page of ``docs/results`` by its file; those of a user's tables too."""
-        names = ["index", "claims", "networks", *(paper["name"] for paper in self.papers)]
+        names = [
+            "index",
+            "claims",
+            "agreement",
+            "networks",
+            *(paper["name"] for paper in self.papers),
+        ]
         return {f"{name}.md": self.page(name) for name in names}
 
     def html(self) -> str:
@@ -201,13 +222,17 @@ class Report:
             for table in self.tables:
                 if table.drawn is not None:
                     save(table.drawn, Path(folder, table.figure))
+            for paper in self.papers:
+                if paper["forest"] is not None:
+                    save(paper["forest"], Path(folder, paper["picture"]))
             return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
     def filled(self, text: str) -> str:
         """Return a page written by hand with its marked numbers made again.
 
         Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
-        the papers and ``count runs`` that of runs, ``cell TABLE COLUMN ROW`` a mean over seeds with
+        the papers and ``count runs`` that of runs, ``signs`` how far they have the printed signs,
+        ``cell TABLE COLUMN ROW`` a mean over seeds with
         its standard deviation, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
         InputError: a mark that names nothing.
         """
@@ -215,6 +240,8 @@ class Report:
 
     def _number(self, mark: str) -> str:
         """What a mark names."""
+        if mark == "signs":
+            return " ".join(signs_in_words(agreements_of(self.contrasts)))
         if mark == "count runs":
             return str(len(self.runs))
         if mark == "count":
@@ -239,8 +266,8 @@ class Report:
         if found.empty:
             return None
         text = statement(found.iloc[0])
-        if found.iloc[0]["verdict"] == "not run":
-            text += f" (`rgbt reproduce table={table} scale=bench seeds=4`)"
+        if found.iloc[0]["verdict"] == NOT_RUN:
+            text += f" (`rgbt reproduce table={table} scale=bench seeds=confirm`)"
         return text
 
 

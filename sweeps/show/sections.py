@@ -16,11 +16,13 @@ from rgbt.runs.provenance import commit_of
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.effects import effects_of
+from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.judged_table import JudgedTable
 from sweeps.plan.request import TAG
 from sweeps.run.progress import duration
 from sweeps.score.efficiency import million_parameters
 from sweeps.score.reader import SEED, RunReader
+from sweeps.show.agreement import forest_of
 from sweeps.show.claims import claim_grids, claim_lines, claims_frame, counted
 from sweeps.show.effects import effects_grids
 from sweeps.show.publish import drawn_of, grid_of
@@ -102,12 +104,20 @@ def _command_of(judged: JudgedTable) -> str:
 
 
 def paper_section(
-    name: str, title: str, reference: str, tables: Sequence[TableSection]
+    name: str,
+    title: str,
+    reference: str,
+    tables: Sequence[TableSection],
+    contrasts: pd.DataFrame,
 ) -> dict[str, Any]:
-    """Return what the template shows of a page of tables: of a paper, of ours, or of the user."""
+    """Return what the template shows of a page of tables: of a paper, of ours, or of the user.
+
+    Its contrasts (`sweeps.judge.agreement.contrasts_frame`) become one picture.
+    """
     own = [table for table in tables if table.page == name]
     frame = claims_of(own)
-    is_run = frame["verdict"] != "not run"
+    is_run = frame["verdict"] != NOT_RUN
+    forest = forest_of(contrasts[contrasts["paper"] == name], title)
     of_tables = frame["table"].str.split("/").str[-1]
     lines = "- " + of_tables + ", `" + frame["claim"] + "`: " + frame["says"]
     return {
@@ -118,6 +128,8 @@ def paper_section(
         "counted": counted(frame),
         "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
         "not_run": "\n".join(lines[~is_run]),
+        "forest": forest,
+        "picture": f"{name}_contrasts.svg" if forest is not None else "",
     }
 
 
@@ -210,7 +222,7 @@ def _runs_of_kind(images: str, scale: str, runs: pd.DataFrame) -> str:
         lines.append((f"`{own}`", seeds, *scores, time, "; ".join(tables)))
     header = ("method", "seeds", *METRICS, "time", "rows of")
     hours = duration(runs["time"].sum())
-    title = f"{len(runs)} runs on {images} images, scale={scale}, {hours} in all"
+    title = f"{len(runs)} runs on {images}, scale={scale}, {hours} in all"
     grid = markdown(TextTable(title, header, tuple(lines)))
     common = " ".join(word for word in shared if word != f"scale={scale}")
     return f"{grid}\n\nAll of them with `{common}`." if common else grid

@@ -111,6 +111,19 @@ def test_seeds_that_not_all_cells_have_are_left_out() -> None:
     assert found["crm", "baseline", "noise"].seeds == 2
 
 
+def test_effects_are_shown_by_declared_seeds_alone() -> None:
+    """Seed 3 was not declared: the others decide, and where one of these is missing, none does."""
+    declaring, name = replace(design_table(), confirm=(0, 1, 2)), ("baseline", "", "noise")
+    line = estimates(declaring, trained(4))[name]
+    assert (line.seeds, line.shown) == (3, "lower")
+    runs = trained(4)
+    runs["baseline N+T+", 1] = failed("no memory")
+    line = estimates(declaring, runs)[name]
+    assert (line.seeds, line.shown) == (1, "explored")
+    explored = estimates(design_table(), trained(4))
+    assert explored["crm", "baseline", "noise"].shown == "explored"
+
+
 def claim(letter: str, expected: Any, part: str = "") -> Claim:
     return Claim(
         name="of an effect",
@@ -127,23 +140,24 @@ def claim(letter: str, expected: Any, part: str = "") -> Claim:
 def test_claims_about_effects_are_judged() -> None:
     """Noise makes region 1 worse, and with it the difference of the regions."""
     claims = (claim("N", "lower"), claim("N", "higher"), claim("T", "higher"))
-    made = replace(design_table(), claims=claims)
+    made = replace(design_table(), claims=claims, confirm=(0, 1, 2))
     found = judged(made, trained(3))
     worse, better, texture = found.claims
-    assert [worse.word, better.word] == ["holds", "contradicted"]
-    assert texture.word != "holds"
+    assert [worse.word, better.word] == ["same direction", "opposite direction"]
+    assert texture.word == "not shown"
     assert worse.verdict is not None
     assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
-    assert "N+ - N- (trained)" in worse.contrast
+    assert "N+ - N- (trained)" in worse.label
     others = {run: outcome for run, outcome in found.runs.items() if run[0] != "baseline N+T-"}
     assert replace(found, runs=others).claims[0].word == "not run"
 
 
 def test_claim_is_about_one_part_of_a_design() -> None:
     claims = tuple(claim("N", "lower", part) for part in ("", "tested", "trained"))
-    found = judged(replace(design_table(tested=WHOLE), claims=claims), trained(3)).claims
-    assert [claim.word for claim in found] == ["not run", "not run", "holds"]
-    assert "N+ - N- (trained)" in found[-1].contrast
+    made = replace(design_table(tested=WHOLE), claims=claims, confirm=(0, 1, 2))
+    found = judged(made, trained(3)).claims
+    assert [claim.word for claim in found] == ["not run", "not run", "same direction"]
+    assert "N+ - N- (trained)" in found[-1].label
 
 
 def test_networks_tested_in_worlds_use_counts_of_each() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from analysis.uncertainty.contrasts import FIXED
 from sweeps.judge.contrasts import as_claimed
-from sweeps.judge.judged_table import JudgedClaim
+from sweeps.judge.judged_claim import JudgedClaim
 from sweeps.plan.claim import Claim
 from sweeps.plan.request import RowSeed
 from sweeps.plan.table import Column, Row, Table
@@ -22,6 +22,7 @@ from tests.sweeps.tabled import failed, outcome, table
 SHARES = {"low": (50.0, 51.0, 49.0), "high": (60.0, 61.5, 59.0), "same": (60.5, 60.0, 60.5)}
 """Accuracies in percent by seed."""
 
+SAME, OPPOSITE, OPEN = "same direction", "opposite direction", "not shown"
 PRINTED = {"low": 50.0, "high": 49.0, "same": 50.5}
 ACC = Column(name="acc", metric="pixel_accuracy")
 
@@ -36,7 +37,7 @@ def of(*claims: Claim, rows: tuple[str, ...] = tuple(SHARES), **others: Any) -> 
     for label in rows:
         values = {"acc": PRINTED[label]} if label in PRINTED else {}
         made.append(Row(label=label, experiment="crm", values=values))
-    return table(tuple(made), (ACC,), claims=claims, **others)
+    return table(tuple(made), (ACC,), claims=claims, **{"confirm": (0, 1, 2), **others})
 
 
 def judge(one: Claim, runs: dict[RowSeed, Outcome] | None = None, **others: Any) -> JudgedClaim:
@@ -52,7 +53,7 @@ def test_true_false_and_undecidable_claims_come_out_so() -> None:
         claim("small", rows=("same",), against=("high",)),
     )
     found = judged(of(*claims), planted(SHARES)).claims
-    assert [claim.word for claim in found] == ["holds", "contradicted", "undecided"]
+    assert [claim.word for claim in found] == [SAME, OPPOSITE, OPEN]
     assert [claim.as_printed for claim in found] == [False, False, True]
     true, _, small = (claim.verdict for claim in found)
     assert true is not None
@@ -70,20 +71,20 @@ def test_paired_seeds_cancel_what_both_rows_share() -> None:
     """Seeds differ by 20 points, the rows of each seed by 2."""
     runs = planted({"low": (40.0, 60.0, 50.0, 55.0), "high": (42.0, 62.0, 52.0, 57.0)})
     found = judge(claim(rows=("high",), against=("low",)), runs)
-    assert found.word == "holds"
+    assert found.word == SAME
 
 
 def test_best_of_all_needs_every_other_row() -> None:
     best = claim(rows=("high",), against=("others",))
     shares = {**SHARES, "same": (55.0, 55.5, 54.0)}
-    assert judge(best, planted(shares)).word == "holds"
+    assert judge(best, planted(shares)).word == SAME
     partly = planted({label: shares[label] for label in ("low", "high")})
     found = judge(best, partly)
-    assert (found.word, found.missing) == ("undecided", ("same",))
+    assert (found.word, found.missing) == (OPEN, ("same",))
     assert found.reason == "Some rows have no score: row 'same' has no finished run."
     worse = {**SHARES, "high": (40.0, 41.0, 39.0)}
     refuted = judge(best, planted({label: worse[label] for label in ("low", "high")}))
-    assert (refuted.word, refuted.missing) == ("contradicted", ("same",))
+    assert (refuted.word, refuted.missing) == (OPPOSITE, ("same",))
 
 
 def test_most_with_rows_not_run_is_never_contradicted() -> None:
@@ -92,9 +93,9 @@ def test_most_with_rows_not_run_is_never_contradicted() -> None:
     most = claim(rows=rows, against=("high",), combine="most")
     shares = {"low": (50.0, 51.0, 49.0), "same": (55.0, 56.0, 54.0), "high": (90.0, 91.0, 89.5)}
     found = judge(most, planted(shares), rows=("high", *rows))
-    assert (found.word, found.missing) == ("undecided", ("first", "second", "third"))
+    assert (found.word, found.missing) == (OPEN, ("first", "second", "third"))
     every = planted({**dict.fromkeys(rows, shares["low"]), "high": shares["high"]})
-    assert judge(most, every, rows=("high", *rows)).word == "contradicted"
+    assert judge(most, every, rows=("high", *rows)).word == OPPOSITE
 
 
 def test_claim_without_runs_is_not_run() -> None:
@@ -107,8 +108,9 @@ def test_claim_without_runs_is_not_run() -> None:
 
 
 def test_one_seed_decides_nothing() -> None:
-    found = judge(claim(rows=("high",), against=("low",)), planted({"low": (50,), "high": (60,)}))
-    assert found.word == "undecided"
+    runs = planted({"low": (50,), "high": (60,)})
+    found = judge(claim(rows=("high",), against=("low",)), runs, confirm=())
+    assert found.word == OPEN
     assert found.verdict is not None
     assert (found.verdict.covers, found.verdict.seeds) == ("images", 1)
     assert math.isnan(found.verdict.seeds_needed)
@@ -120,7 +122,7 @@ def test_predictions_without_seeds_are_compared_with_every_seed() -> None:
         ("low", FIXED): outcome("file", accuracy(50.0, 7)),
     }
     found = judge(claim(rows=("high",), against=("low",)), runs)
-    assert found.word == "holds"
+    assert found.word == SAME
     assert found.verdict is not None
     assert found.verdict.seeds == 3
 
@@ -133,11 +135,11 @@ def test_most_are_more_than_half() -> None:
 def test_mean_and_any_combine_contrasts() -> None:
     two = {"rows": ("high", "low"), "against": ("same",)}
     shares = {**SHARES, "high": (70.0, 71.0, 69.0)}
-    assert judge(claim(**two, combine="any"), planted(shares)).word == "holds"
-    assert judge(claim(**two), planted(shares)).word == "contradicted"
+    assert judge(claim(**two, combine="any"), planted(shares)).word == SAME
+    assert judge(claim(**two), planted(shares)).word == OPPOSITE
     mean = judge(claim(**two, combine="mean", at_most=5.0, expected="similar"), planted(shares))
-    assert mean.word == "holds"
-    assert mean.contrast == "mean of 2 contrasts"
+    assert mean.word == SAME
+    assert mean.label == "mean of 2 contrasts"
     assert mean.printed == pytest.approx((49.0 + 50.0) / 2 - 50.5)
 
 
@@ -149,7 +151,7 @@ def test_best_row_is_marked_where_it_is_shown(best: Any, marks: dict[str, int]) 
     column = Column(name="acc", metric="pixel_accuracy", best=best)
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "mid", "high"))
     shares = {"low": (50.0, 51.0, 49.0), "mid": (70.0, 71.0, 70.5), "high": (90.0, 91.0, 90.0)}
-    made = table(rows, (column,))
+    made = table(rows, (column,), confirm=(0, 1, 2))
     given = planted(shares)
     found = judged(made, given)
     assert found.scored.marks == {(label, "acc"): rank for label, rank in marks.items()}
@@ -164,7 +166,7 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     runs |= {("again", seed): run for (label, seed), run in list(runs.items()) if label == "high"}
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "again"))
     one = claim(rows=("high",), against=("again",))
-    made = judged(table(rows, (ACC,), claims=(one,)), runs)
+    made = judged(table(rows, (ACC,), claims=(one,), confirm=(0, 1, 2)), runs)
     assert made.scored.marks == {("high", "acc"): 1, ("again", "acc"): 1}
     (found,) = made.claims
     assert found.word == "not run"
@@ -208,6 +210,6 @@ def test_seeds_without_the_evaluation_do_not_count() -> None:
             made = {(): own, ("modality=rgb",): of_rgb} if seed < 2 else own
             runs[label, seed] = outcome(f"{label}{seed}", made)
     rgb = replace(of(one), columns=(Column(**{**vars(ACC), "modality": "rgb"}),))
-    (found,) = judged(rgb, runs).claims
+    (found,) = judged(replace(rgb, confirm=(0, 1)), runs).claims
     assert found.verdict is not None
     assert (found.verdict.seeds, round(found.verdict.estimate)) == (2, 10)

@@ -86,17 +86,21 @@ def test_rows_of_undecided_claims_get_seeds_up_to_maximum() -> None:
     outcomes = complete(until)
     assert seeds(outcomes) == {"ours": DECIDED, "base": MAX, "twin": MAX, "other": START}
     _, found = replace(until.judged, runs=until.judged.request.runs(outcomes)).claims
-    assert (found.word, found.verdict and found.verdict.seeds) == ("undecided", MAX)
+    assert (found.word, found.verdict and found.verdict.seeds) == ("not shown", MAX)
 
 
-def test_added_points_have_one_seed_and_name_the_rule() -> None:
+def test_added_points_have_one_seed_that_is_not_declared() -> None:
     until = adding(OPEN)
     further = until(finished(until.judged.request.points()))
     assert [(row_of(point), seed_of(point.overrides)) for point in further] == [
         ("base", START),
         ("twin", START),
     ]
-    assert all("rgbt.until_decided/own/t" in point.tags for point in further)
+    request = until.judged.request
+    declaring = replace(request, table=replace(request.table, confirm=(START, START + 1)))
+    until = replace(until, judged=replace(until.judged, request=declaring))
+    further = until(finished(declaring.points()))
+    assert {seed_of(point.overrides) for point in further} == {START + 2}
 
 
 def test_at_most_two_seeds_of_a_claim_are_unfinished() -> None:

@@ -1,0 +1,149 @@
+"""How far runs rank like the printed values: a sentence, grids, and one picture a paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rgbt.tables import ABSENT, TextTable
+from sweeps.judge.agreement import Agreement
+from sweeps.show.figure import OURS, PUBLISHED
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PALE = "#9CC7E3"
+# Most letters of the name of a contrast in a picture.
+LETTERS = 58
+# Differences below this are drawn to a linear scale, others to a logarithmic one.
+LINEAR = 1.0
+
+
+def signs_in_words(agreements: Sequence[Agreement]) -> list[str]:
+    """Say of how many contrasts the sign is the printed one, a sentence for each kind of runs."""
+    sentences = []
+    for found in agreements:
+        share = f"{100 * found.alike / found.contrasts:.0f} %"
+        if not math.isnan(found.low):
+            share += f" [{100 * found.low:.0f}, {100 * found.high:.0f}]"
+        sentences.append(
+            f"on {found.images} at scale={found.scale}, {found.alike} of {found.contrasts} "
+            f"contrasts have the printed sign, {share}, where chance gives 50 %; of those whose "
+            f"interval excludes 0, {found.decided_alike} of {found.decided}"
+        )
+    return sentences
+
+
+def agreement_lines(agreements: Sequence[Agreement], ranks: pd.DataFrame) -> list[str]:
+    """Say how far results foretell the printed ones, two sentences for each kind of runs."""
+    lines = []
+    for found, sentence in zip(agreements, signs_in_words(agreements), strict=True):
+        line = f"{sentence[:1].upper()}{sentence[1:]}."
+        own = ranks[(ranks["images"] == found.images) & (ranks["scale"] == found.scale)]
+        if len(own):
+            above, below = int((own["low"] > 0).sum()), int((own["high"] < 0).sum())
+            line += (
+                f" Spearman's correlation of the rows with print has the median "
+                f"{own['rho'].median():+.2f} over {len(own)} scores of tables; {above} are shown "
+                f"to be above 0, {below} below."
+            )
+        lines.append(line)
+    return lines
+
+
+def ranks_grid(ranks: pd.DataFrame) -> TextTable:
+    """Show the rank correlation of each table and column."""
+    rows = []
+    for _, row in ranks.iterrows():
+        ends = ABSENT
+        if not math.isnan(row["low"]):
+            ends = f"[{row['low']:+.2f}, {row['high']:+.2f}]"
+        where = f"{row['images']}, scale={row['scale']}"
+        rows.append(
+            (row["table"], row["column"], where, str(row["rows"]), f"{row['rho']:+.2f}", ends)
+        )
+    header = ("table", "score", "on", "rows", "Spearman", "95 % interval")
+    return TextTable("", header, tuple(rows))
+
+
+def signs_grid(contrasts: pd.DataFrame) -> TextTable:
+    """Count the contrasts of each table whose sign is the printed one."""
+    ours = contrasts["confirmed"].fillna(contrasts["explored"])
+    frame = contrasts.assign(alike=ours * contrasts["printed"] > 0, ours=ours)
+    frame = frame[frame["ours"].notna() & (frame["printed"] != 0)]
+    rows = []
+    for (table, images, scale), own in frame.groupby(["table", "images", "scale"], sort=True):
+        confirmed = str(own["confirmed"].notna().sum())
+        alike = f"{own['alike'].sum()} of {len(own)}"
+        rows.append((str(table), f"{images}, scale={scale}", alike, confirmed))
+    header = ("table", "on", "sign as printed", "by declared seeds")
+    return TextTable("", header, tuple(rows))
+
+
+def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
+    """Draw the contrast that decides each claim: printed hollow, explored pale, confirmed full.
+
+    Those that disagree most with print are on top. `contrasts` is that of
+    `sweeps.judge.agreement.contrasts_frame`; None where nothing is to be drawn.
+    """
+    from analysis.figures.plots import new_figure
+
+    ours = contrasts["confirmed"].fillna(contrasts["explored"])
+    frame = contrasts.assign(ours=ours)[contrasts["decides"] & ours.notna()]
+    if frame.empty:
+        return None
+    # Of a printed gain and a loss of ours the gap is relative to the printed size.
+    gap = (frame["ours"] - frame["printed"]) / frame["printed"].abs().clip(lower=0.1)
+    frame = frame.assign(gap=gap * frame["printed"].map(lambda value: 1 if value >= 0 else -1))
+    frame = frame.sort_values("gap", kind="stable")
+    figure = new_figure(8.6, 1.6 + 0.21 * len(frame))
+    axes = figure.subplots()
+    axes.axvline(0, color="grey", lw=0.8, zorder=1)
+    _marks(axes, frame, "explored", PALE, "ours, explored", 0.14)
+    _marks(axes, frame, "confirmed", OURS, "ours, confirmed by declared seeds", -0.14)
+    places = range(len(frame))
+    axes.scatter(
+        frame["printed"],
+        places,
+        s=26,
+        facecolors="none",
+        edgecolors=PUBLISHED,
+        zorder=4,
+        label="printed",
+    )
+    axes.set_xscale("symlog", linthresh=LINEAR)
+    axes.set_ylim(len(frame) - 0.5, -0.5)
+    axes.set_yticks(places, [_name_of(row) for _, row in frame.iterrows()], fontsize=7)
+    axes.set_xlabel("difference in percent points (Var: squared); linear between -1 and 1")
+    axes.grid(axis="x", alpha=0.25)
+    kinds = sorted({f"{row['images']}, scale={row['scale']}" for _, row in frame.iterrows()})
+    figure.suptitle(f"{title}: printed differences and ours ({'; '.join(kinds)})", fontsize=10)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
+    return figure
+
+
+def _marks(
+    axes: Axes, frame: pd.DataFrame, kind: str, colour: str, label: str, shift: float
+) -> None:
+    places = [place + shift for place in range(len(frame))]
+    low = (frame[kind] - frame[f"{kind}_low"]).fillna(0.0)
+    high = (frame[f"{kind}_high"] - frame[kind]).fillna(0.0)
+    axes.errorbar(
+        frame[kind],
+        places,
+        xerr=[low, high],
+        fmt="o",
+        ms=3.5,
+        lw=1.2,
+        color=colour,
+        zorder=3,
+        label=label,
+    )
+
+
+def _name_of(row: pd.Series) -> str:
+    text = f"{row['table'].rpartition('/')[2]}: {row['contrast']}"
+    return text if len(text) <= LETTERS else f"{text[: LETTERS - 1]}…"

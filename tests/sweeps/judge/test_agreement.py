@@ -1,0 +1,98 @@
+"""Rank correlation with print, and signs of contrasts, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sweeps.judge.agreement import agreements_of, contrasts_frame, rank_correlations, ranks_of
+from sweeps.judge.judged_table import JudgedTable
+from sweeps.plan.claim import Claim
+from sweeps.plan.table import Column, Row
+from sweeps.show.agreement import agreement_lines, forest_of, ranks_grid, signs_grid
+from tests.sweeps.judge.accuracies import judged, planted
+from tests.sweeps.tabled import table
+
+SHARES = {"a": (50.0, 51.0, 50.5), "b": (60.0, 61.0, 60.5), "c": (80.0, 81.0, 80.5)}
+PRINTED = {"a": 50.0, "b": 53.0, "c": 52.0}
+
+
+def made(name: str, shares: dict[str, tuple[float, ...]]) -> JudgedTable:
+    """A table whose printed order is a, c, b."""
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"mIoU": PRINTED[label]}) for label in shares
+    )
+    claims = tuple(
+        Claim(
+            name=f"{row} above {other}",
+            says="S.",
+            source="I",
+            rows=(row,),
+            against=(other,),
+            columns=("mIoU",),
+            expected="higher",
+        )
+        for row, other in (("b", "a"), ("a", "b"), ("b", "c"), ("c", "a"))
+    )
+    column = Column(name="mIoU", metric="mIoU")
+    given = table(rows, (column,), claims=claims, confirm=(0, 1, 2))
+    return judged(given, planted(shares), name=name)
+
+
+def test_rank_correlation_by_hand() -> None:
+    """1 - 6 sum d^2 / (n (n^2 - 1)); with ties the correlation of the mean ranks."""
+    printed = np.array([1.0, 2.0, 3.0, 4.0])
+    drawn = np.array([[5.0, 6.0, 7.0, 8.0], [8.0, 7.0, 6.0, 5.0], [6.0, 5.0, 7.0, 8.0]])
+    assert rank_correlations(drawn, printed) == pytest.approx([1.0, -1.0, 1 - 6 * 2 / 60])
+    tied = rank_correlations(drawn[:1], np.array([1.0, 1.0, 2.0, 3.0]))
+    assert tied == pytest.approx(np.corrcoef([1, 2, 3, 4], [1.5, 1.5, 3, 4])[0, 1])
+
+
+def test_ranks_of_tables_and_their_interval() -> None:
+    ranks = ranks_of([made("p/one", SHARES)])
+    (row,) = ranks.to_dict("records")
+    assert (row["table"], row["rows"], row["scale"]) == ("p/one", 3, "unknown")
+    assert row["rho"] == pytest.approx(0.5)
+    assert (row["low"], row["high"]) == pytest.approx((0.5, 0.5)), "our order is certain"
+    noisy = {**SHARES, "b": (90.0, 40.0, 80.0)}
+    (row,) = ranks_of([made("p/one", noisy)]).to_dict("records")
+    assert row["low"] < 0.5 < row["high"]
+    twins = {"a": SHARES["a"], "b": SHARES["b"]}
+    assert ranks_of([made("p/one", twins)]).empty, "two rows are always ranked alike or opposite"
+    single = {label: shares[:1] for label, shares in SHARES.items()}
+    (row,) = ranks_of([made("p/one", single)]).to_dict("records")
+    assert math.isnan(row["low"])
+
+
+def test_signs_of_different_contrasts_are_counted_once() -> None:
+    """b above a and c above a are so in print and ours, b above c in print alone."""
+    first = made("p/one", SHARES)
+    contrasts = contrasts_frame([first])
+    assert contrasts["claim"].tolist() == ["b above a", "b above c", "c above a"]
+    (found,) = agreements_of(contrasts)
+    assert (found.alike, found.contrasts, found.decided_alike, found.decided) == (2, 3, 2, 3)
+    assert math.isnan(found.low), "one table has no spread over tables"
+    other = {**SHARES, "c": (10.0, 11.0, 10.5)}
+    both = contrasts_frame([first, made("p/two", other)])
+    # The second table has the same runs of a and b, and its own of c.
+    assert len(both) == 3 + (0 if contrasts.empty else 0) or len(both) > 3
+    lines = agreement_lines(agreements_of(both), ranks_of([first]))
+    assert "contrasts have the printed sign" in lines[0]
+    assert "0 below" in lines[0]
+
+
+def test_agreement_is_shown_and_drawn() -> None:
+    tables = [made("p/one", SHARES)]
+    contrasts = contrasts_frame(tables)
+    text = signs_grid(contrasts).to_markdown() + ranks_grid(ranks_of(tables)).to_markdown()
+    assert "| p/one | unknown images, scale=unknown | 2 of 3 | 3 |" in text
+    assert "+0.50 | [+0.50, +0.50]" in text
+    figure = forest_of(contrasts, "P")
+    assert figure is not None
+    (axes,) = figure.axes
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    assert names[0] == "one: b - c, mIoU", "the sign that differs from print is on top"
+    assert len(names) == 3
+    assert forest_of(contrasts.iloc[:0], "P") is None
