@@ -14,6 +14,9 @@ from rgbt.tables import ABSENT, TextTable
 # Most regions that become columns; more become rows.
 WIDEST = 12
 
+# What the images at hand say about a statement: it is of the paper's images, not of these.
+HERE = {"holds": "as stated", "contradicted": "not so", "undecided": "not shown"}
+
 CLASS_QUANTITIES = {
     "class_occupancy": "by class, % of the pixels",
     "class_occupancy_normalised": "by class, % of its largest region (Fig. 3)",
@@ -77,12 +80,12 @@ def statement_table(frame: pd.DataFrame, level: float) -> TextTable:
     shown = pd.DataFrame(
         {
             "statement": statements.mask(repeated, ""),
-            "verdict": frame["verdict"].mask(repeated, ""),
+            "on these images": frame["verdict"].map(HERE).mask(repeated, ""),
             "number": frame["contrast"],
             "value": frame["value"].map(digits),
             f"{100 * level:g} % interval": _intervals(frame),
             "stated": frame["wanted"],
-            "alone": frame["finding"],
+            "alone": frame["finding"].map(HERE),
         }
     )
     title = "statements of SpatialSeg, Sec. III"
@@ -94,7 +97,7 @@ def estimator_table(frame: pd.DataFrame) -> TextTable:
     rows = frame[frame["estimator"] != ""]
     rows = rows.assign(
         way=rows["estimator"] + ", " + rows["average"],
-        text=rows["value"].map(digits) + " " + rows["finding"],
+        text=rows["value"].map(digits) + " " + rows["finding"].map(HERE),
     )
     wide = rows.set_index(["contrast", "wanted", "way"])["text"].unstack(sort=False)
     title = "how signal to noise depends on the estimator of the noise and on the average"

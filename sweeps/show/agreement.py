@@ -115,6 +115,7 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
         label="printed",
     )
     axes.set_xscale("symlog", linthresh=LINEAR)
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_ylim(len(frame) - 0.5, -0.5)
     axes.set_yticks(places, [_name_of(row) for _, row in frame.iterrows()], fontsize=7)
     axes.set_xlabel("difference in percent points (Var: squared); linear between -1 and 1")
@@ -145,5 +146,7 @@ def _marks(
 
 
 def _name_of(row: pd.Series) -> str:
-    text = f"{row['table'].rpartition('/')[2]}: {row['contrast']}"
+    is_mean = row["contrast"].startswith("mean of")
+    what = row["claim"].replace("_", " ") if is_mean else row["contrast"]
+    text = f"{row['table'].rpartition('/')[2]}: {what}"
     return text if len(text) <= LETTERS else f"{text[: LETTERS - 1]}…"

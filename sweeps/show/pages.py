@@ -111,7 +111,7 @@ class Report:
         for table in self.tables:
             known.setdefault(table.page, (table.page, "Tables of the user."))
         return [
-            paper_section(name, title, reference, self.tables, self.contrasts)
+            paper_section(name, title, reference, self.tables, self.contrasts, self.ranks)
             for name, (title, reference) in known.items()
         ]
 

@@ -15,6 +15,7 @@ from rgbt.runs.folder import GROUP
 from rgbt.runs.provenance import commit_of
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
+from sweeps.judge.agreement import agreements_of
 from sweeps.judge.effects import effects_of
 from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.judged_table import JudgedTable
@@ -22,7 +23,7 @@ from sweeps.plan.request import TAG
 from sweeps.run.progress import duration
 from sweeps.score.efficiency import million_parameters
 from sweeps.score.reader import SEED, RunReader
-from sweeps.show.agreement import forest_of
+from sweeps.show.agreement import agreement_lines, forest_of
 from sweeps.show.claims import claim_grids, claim_lines, claims_frame, counted
 from sweeps.show.effects import effects_grids
 from sweeps.show.publish import drawn_of, grid_of
@@ -109,15 +110,18 @@ def paper_section(
     reference: str,
     tables: Sequence[TableSection],
     contrasts: pd.DataFrame,
+    ranks: pd.DataFrame,
 ) -> dict[str, Any]:
     """Return what the template shows of a page of tables: of a paper, of ours, or of the user.
 
-    Its contrasts (`sweeps.judge.agreement.contrasts_frame`) become one picture.
+    Its contrasts and ranks (`sweeps.judge.agreement`) become one picture, and a sentence.
     """
     own = [table for table in tables if table.page == name]
     frame = claims_of(own)
     is_run = frame["verdict"] != NOT_RUN
-    forest = forest_of(contrasts[contrasts["paper"] == name], title)
+    of_paper = contrasts[contrasts["paper"] == name]
+    of_tables = ranks[ranks["table"].isin([table.judged.request.name for table in own])]
+    forest = forest_of(of_paper, title)
     of_tables = frame["table"].str.split("/").str[-1]
     lines = "- " + of_tables + ", `" + frame["claim"] + "`: " + frame["says"]
     return {
@@ -128,6 +132,7 @@ def paper_section(
         "counted": counted(frame),
         "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
         "not_run": "\n".join(lines[~is_run]),
+        "agreement": agreement_lines(agreements_of(of_paper), of_tables),
         "forest": forest,
         "picture": f"{name}_contrasts.svg" if forest is not None else "",
     }

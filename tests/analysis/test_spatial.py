@@ -26,7 +26,7 @@ def test_command_prints_tables_and_writes_files(call: Call, data: Path, tmp_path
         *("statements of SpatialSeg, Sec. III", "how signal to noise depends on the estimator"),
     ):
         assert title in printed
-    assert "undecided" in printed  # 4 images by day are too few
+    assert "not shown" in printed  # 4 images by day are too few
     assert "signal to noise is lower in the centre (rgb and thermal, day and night), immerkaer" in (
         printed
     )

@@ -11,7 +11,6 @@ import pytest
 from rgbt.files.plain_files import write_json
 from sweeps.claims import entry as claims
 from sweeps.plan.planner import Planner
-from sweeps.plan.request import UNTIL_DECIDED
 from sweeps.reproduce import entry as reproduce
 from tests.commands import Call, assert_one_sentence
 from tests.measured import remeasured
@@ -22,6 +21,7 @@ paper: my
 number: planted
 caption: outcomes that are known
 data: nothing
+confirm: [0, 1, 2]
 columns:
   - {name: acc, metric: pixel_accuracy}
 claims:
@@ -75,7 +75,8 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-WORDS = ["holds", "contradicted", "undecided", "not run"]
+WORDS = ["same direction", "opposite direction", "not shown", "not run"]
+COUNTED = "4 claims: 1 same direction, 1 opposite direction, 1 not shown, 1 not run; 3 by declared"
 
 
 def test_reproduce_ends_with_a_verdict_per_claim(call: Call, place: Path) -> None:
@@ -83,14 +84,14 @@ def test_reproduce_ends_with_a_verdict_per_claim(call: Call, place: Path) -> Non
     words = ("table=my/planted", "seeds=3", "tracking=none", "out=here", SMOKE)
     code, out, _ = call(reproduce, *words)
     assert code == 0
-    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in out
+    assert COUNTED in " ".join(out.split())
     found = rows_of(place / "here" / "claims.csv")
     assert [row["verdict"] for row in found] == WORDS
     assert [row["as_printed"] for row in found] == ["True", "False", "True", "True"]
     assert found[3]["missing"] == "theirs"
     text = (place / "here" / "table.md").read_text()
-    assert "- `true_one`: High is above low. **Holds**: high - low, acc +" in text
-    assert "unknown images, scale=unknown, a start for each seed, 3 seeds). (Sec. I) The" in text
+    assert "- `true_one`: High is above low. **Same direction** on unknown images: +" in text
+    assert "high - low, acc; unknown images, scale=unknown, a start for each seed." in text
     marked = [line for line in text.splitlines() if "**" in line and line.startswith("| ")]
     assert not marked, "high and same cannot be told apart, so that no row is the best"
 
@@ -99,7 +100,7 @@ def test_claims_reads_the_store(call: Call, place: Path) -> None:
     plant(place / "runs")
     code, out, err = call(claims, "table=my/planted", "out=there", SMOKE)
     assert code == 0, err
-    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in out
+    assert COUNTED in " ".join(out.split())
     assert [line.split() for line in out.splitlines() if " my " in line][-1][-3:] == [
         *"3",
         "of",
@@ -108,13 +109,24 @@ def test_claims_reads_the_store(call: Call, place: Path) -> None:
     assert [row["verdict"] for row in rows_of(place / "there" / "claims.csv")] == WORDS
     assert "(Sec. III)" in (place / "there" / "claims.md").read_text()
     code, out, _ = call(claims, "table=my/planted,crm/table4")
-    assert (code, "6 claims: 6 not run." in out) == (0, True), "at full size nothing was run"
+    assert (code, "6 claims: 6 not run; 0 by" in out) == (0, True), "at full size nothing was run"
 
 
-def test_seeds_that_were_added_are_judged_at_any_time(call: Call, place: Path) -> None:
-    plant(place / "runs", {f"{UNTIL_DECIDED}my/planted": "true"})
+def test_seeds_that_are_not_declared_explore(call: Call, place: Path) -> None:
+    plant(place / "runs")
+    own = place / "tables" / "my" / "planted.yaml"
+    own.write_text(TABLE.replace("confirm: [0, 1, 2]\n", ""))
     _, out, _ = call(claims, "table=my/planted", SMOKE)
-    assert "4 claims: 3 undecided, 1 not run." in out
+    assert "4 claims: 3 not shown, 1 not run; 0 by declared seeds." in " ".join(out.split())
+    assert call(reproduce, "table=my/planted", "seeds=confirm", "dry_run=true", SMOKE)[0] == 2
+
+
+def test_claims_say_how_far_runs_rank_like_print(call: Call, place: Path) -> None:
+    plant(place / "runs")
+    _, out, _ = call(claims, "table=my/planted", SMOKE)
+    said = " ".join(out.split())
+    assert "Of 3 claims judged at 5 %, chance alone would show up to 0.1 in the claimed" in said
+    assert "On unknown images at scale=unknown, 3 of 3 contrasts have the printed sign" in said
 
 
 def test_dry_run_until_decided_shows_the_next_runs(call: Call, place: Path) -> None:

@@ -34,6 +34,7 @@ paper: my
 number: planted
 caption: outcomes that are known
 data: nothing
+confirm: [0, 1, 2]
 columns: [{name: acc, metric: pixel_accuracy}]
 claims:
   - {name: true_one, says: High is above low., source: Sec. I, rows: [high], against: [low],
@@ -102,11 +103,14 @@ def test_own_table_shows_values_verdicts_and_their_basis(report: Report) -> None
     text = section(report.page("my"), "## planted (scale=demo)")
     assert "| low | ours | 3 | 49.92 ± 1.31 |\n|  | published |  | 50 |\n" in text
     assert "|  | difference |  | -0.08 |" in text
-    assert "4 claims: 1 holds, 2 contradicted, 1 not run." in text
-    basis = "(synthetic images, scale=demo, a start for each seed, 3 seeds)"
+    assert "4 claims: 1 same direction, 2 opposite direction, 1 not run; 3 by declared" in text
+    basis = "synthetic scenes, scale=demo, a start for each seed"
     line = next(line for line in text.splitlines() if line.startswith("- `true_one`"))
-    assert "**Holds**: high - low, acc +9.87 [+8.02, +11.72]" in line
-    assert f"{basis}. (Sec. I) The printed values agree (+10.00)." in line
+    assert "**Same direction** on synthetic scenes: +9.87 [+8.02, +11.72], printed +10.00" in line
+    assert (
+        "(as printed); confirmation by 3 declared seeds. (Sec. I) The printed values agree" in line
+    )
+    assert f" high - low, acc; {basis}." in line
     assert "Alike means within 1." in text
     assert "    - A reading of ours." in text
     assert "- `waits`: Theirs is below low. **Not run.** (Sec. IV)" in text
@@ -146,10 +150,11 @@ def test_runs_of_one_start_are_apart_with_a_warning(report: Report) -> None:
     text = report.page("spatialseg")
     own = section(text, "## TABLE III (scale=bench)")
     one = section(text, "## TABLE III (scale=bench, seeds.start=common)")
-    assert "a start for each seed, 3 seeds" in own
+    assert "exploration with 3 seeds, not confirmed" in own
+    assert "a start for each seed" in own
     assert "began from one start" not in own
-    assert "one start for all seeds, seeds.start=common, 3 seeds" in one
-    assert one.count("All seeds began from one start") == one.count("(synthetic images")
+    assert "one start for all seeds, seeds.start=common." in one
+    assert one.count("All seeds began from one start") == one.count(", one start for all seeds")
     assert "Every row of ours was run with seeds.start=common." in one
     assert "seeds=3 scale=bench seeds.start=common" in one
     limits = section(report.page("claims"), "## What the verdicts do not say")
@@ -165,14 +170,14 @@ def test_claims_are_counted_once_and_shown_for_every_basis(report: Report) -> No
     titles = [line for line in page.splitlines() if line.startswith("**")]
     assert len(titles) == 2, "verdicts of several bases are in several tables"
     assert {"a start for each seed" in title for title in titles} == {True, False}
-    assert "| verdict | claim | ours | printed | seeds | would decide |" in page
+    assert "| verdict | claim | ours | printed | size | seeds | would decide |" in page
     row = next(line for line in report.page("claims").splitlines() if line.startswith("| crm |"))
-    assert [cell.strip() for cell in row.split("|")][2:7] == ["0", "0", "0", "24", "22 of 23"]
+    assert [cell.strip() for cell in row.split("|")][-4:-1] == ["24", "0", "22 of 23"]
 
 
 def test_index_has_runs_with_seeds_spread_and_time(report: Report) -> None:
     text = report.page("index")
-    assert "**6 runs on synthetic images, scale=demo, 6 min in all**" in text
+    assert "**6 runs on synthetic scenes, scale=demo, 6 min in all**" in text
     assert text.index("## Claims by verdict") < text.index("## Runs") < text.index("| git commit |")
     line = next(line for line in text.splitlines() if line.startswith("| `baseline` |"))
     cells = [cell.strip() for cell in line.split("|")]
@@ -298,6 +303,7 @@ def test_archive_gives_same_pages_and_run_changes_them(
 MARKS = """
 <!-- results:count -->stale<!-- /results --> claims,
 <!-- results:count runs -->stale<!-- /results --> runs.
+<!-- results:signs -->stale<!-- /results -->
 <!-- results:claim my/planted true_one -->stale<!-- /results -->
 <!-- results:cell my/planted acc low -->stale<!-- /results --> points.
 <!-- results:effects spatial_bias centre -->stale<!-- /results -->
@@ -308,7 +314,9 @@ def test_marked_numbers_are_made_again_and_nothing_else(report: Report) -> None:
     text = report.filled(MARKS)
     assert "<!-- results:count -->162<!-- /results --> claims," in text  # 158 of the papers, 4
     assert f"count runs -->{len(report.runs)}<!-- /results --> runs." in text
-    assert "High is above low. **Holds**: high - low, acc +9.87" in text
+    assert "High is above low. **Same direction** on synthetic scenes: +9.87" in text
+    assert "signs -->on synthetic scenes at scale=bench, " in text
+    assert "on synthetic scenes at scale=demo, 1 of 1 contrasts have the printed sign" in text
     assert "acc low -->49.92 ± 1.31<!-- /results --> points." in text
     assert "No run yet: `rgbt reproduce table=spatial_bias rows=tested" in text
     assert report.filled(text) == text
@@ -347,7 +355,17 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
     code, said, err = call(entry, *words)
     assert code == 0, err
     assert {path.stem for path in out.glob("*.md")} == {
-        *("index", "claims", "networks", "studies", "my", "without", "measurements", *PAPERS)
+        *(
+            "index",
+            "claims",
+            "agreement",
+            "networks",
+            "studies",
+            "my",
+            "without",
+            "measurements",
+            *PAPERS,
+        )
     }
     found = {path.name for path in out.glob("*.svg")}
     assert {"my-planted_demo.svg", "spatialseg-table3_bench-20e4b0.svg"} <= found
