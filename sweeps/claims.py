@@ -46,7 +46,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
-    from sweeps.judge.agreement import agreements_of, contrasts_frame, ranks_of
+    from sweeps.judge.agreement import contrasts_frame, ranks_of, signs_of
     from sweeps.show.agreement import agreement_lines
     from sweeps.show.claims import (
         chance_of,
@@ -63,7 +63,7 @@ def main(options: Options, overrides: list[str]) -> int:
     run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
     print_rich(Group(*map(rich_table, [*claim_grids(frame, noted=True), counts_grid(frame)])))
     print_rich(f"{counted(frame)} ({run_as})")
-    lines = agreement_lines(agreements_of(contrasts_frame(tables)), ranks_of(tables))
+    lines = agreement_lines(signs_of(contrasts_frame(tables)), ranks_of(tables))
     print_rich(plain_text("\n".join(filter(None, [chance_of(frame), *lines]))))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)

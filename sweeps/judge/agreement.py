@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.uncertainty.blocks import Values
 from analysis.uncertainty.verdicts import Verdict
 from rgbt.randomness import numpy_generator
-from sweeps.judge.judged_claim import Judged, JudgedClaim
+from sweeps.judge.judged_claim import JudgedClaim
 from sweeps.judge.judged_table import JudgedTable
 from sweeps.judge.seeds import Scores, negated
 from sweeps.plan.table import Column
@@ -39,27 +39,11 @@ CONTRASTS = [
 CONTRASTS += ["explored_high", "explored_seeds", "confirmed", "confirmed_low", "confirmed_high"]
 CONTRASTS += ["confirmed_seeds"]
 
+SIGNS = ["images", "scale", "alike", "contrasts", "low", "high", "decided_alike", "decided"]
+
 # Rows below which a rank correlation says nothing.
 FEWEST_ROWS = 3
 DRAWS = 4_000
-
-
-class Agreement(NamedTuple):
-    """Of how many contrasts the sign is the printed one.
-
-    `low` and `high` are the ends of the 95 % interval of the share, with tables drawn anew, because
-    the contrasts of a table share rows; NaN for one table. `decided`: those whose interval excludes
-    0, and `decided_alike` of them with the printed sign.
-    """
-
-    images: str
-    scale: str
-    alike: int
-    contrasts: int
-    low: float
-    high: float
-    decided_alike: int
-    decided: int
 
 
 def ranks_of(tables: Sequence[JudgedTable]) -> pd.DataFrame:
@@ -151,7 +135,7 @@ def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
     return pd.DataFrame(list(rows.values()), columns=CONTRASTS)
 
 
-def _contrast(claim: JudgedClaim, single: Judged) -> dict[str, Any]:
+def _contrast(claim: JudgedClaim, single: JudgedClaim) -> dict[str, Any]:
     row: dict[str, Any] = {
         "paper": claim.table.rpartition("/")[0] or "studies",
         "table": claim.table,
@@ -176,8 +160,17 @@ def _numbers(verdict: Verdict | None) -> tuple[float, float, float, int]:
     return verdict.estimate, *ends, verdict.seeds
 
 
-def agreements_of(contrasts: pd.DataFrame) -> list[Agreement]:
-    """Count signs as printed among contrasts (`contrasts_frame`), by kind of images and scale."""
+def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
+    """Count signs as printed among contrasts (`contrasts_frame`), by kind of images and scale.
+
+    Returns:
+        the columns `SIGNS`: alike of so many contrasts have the printed sign; low and high are the
+        ends of the 95 % interval of the share, with tables drawn anew, because the contrasts of a
+        table share rows (NaN for one table); decided: those whose interval excludes 0, and
+        decided_alike of them with the printed sign.
+    """
+    import pandas as pd
+
     found = []
     for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
         ours = group["confirmed"].fillna(group["explored"])
@@ -190,10 +183,9 @@ def agreements_of(contrasts: pd.DataFrame) -> list[Agreement]:
             continue
         by_table = alike[known].groupby(group["table"][known])
         ends = _share_interval(by_table.sum().to_numpy(), by_table.size().to_numpy())
-        counts = (int(alike.sum()), int(known.sum()))
-        of_decided = (int((alike & decided).sum()), int(decided.sum()))
-        found.append(Agreement(str(images), str(scale), *counts, *ends, *of_decided))
-    return found
+        of_decided = ((alike & decided).sum(), decided.sum())
+        found.append((images, scale, alike.sum(), known.sum(), *ends, *of_decided))
+    return pd.DataFrame(found, columns=SIGNS)
 
 
 def _share_interval(alike: Values, every: Values) -> tuple[float, float]:

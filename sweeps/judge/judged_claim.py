@@ -31,22 +31,50 @@ Basis = Literal["confirmation", "exploration", "evaluation", "counted"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
-    """One contrast, or a claim about several, judged by finished runs.
+class JudgedClaim:
+    """A claim, or one of its contrasts by itself, with its verdict and what that is about.
 
     Attributes:
+        table: its name, e.g. "spatialseg/table3".
         label: of the contrast whose numbers are shown.
-        printed: the same contrast of the printed values; None where one is missing.
+        contrasts: those of different runs, in the order of the claim, each judged by itself.
+        scores: of one contrast: the scores and runs that it is made of.
+        printed: the contrast of the printed values; None where one is missing.
+        as_printed: whether the printed values agree with the claim; None: some are missing.
         exploration: by all seeds but those that the table declares, valid at any time.
         confirmation: by the declared seeds alone; None where a row lacks one of them.
-        scores: the scores and runs of the contrasts: who has the same, compares the same.
+        rows: labels of the rows that it is about, in the order of the table.
+        missing: those without a finished run.
+        complete: whether every contrast of it could be computed.
+        reason: why there is no verdict, or why it is open; one sentence, or "".
+        images: "synthetic scenes", "real images of mfnet", ...; of several kinds all; "": no runs.
+        scale: of the runs, in the same way.
+        of_paper: whether the runs are the paper's: scale=paper, real images, no changed setting.
+        is_level: whether it is about how high a score is.
+        same_as: the claim before it that asks the same of the same runs, or "".
+        warnings: rows of different lists; rows of one seed that were trained on different machines;
+            contrasts that are the same runs.
     """
 
+    table: str
+    claim: Claim
     label: str
+    contrasts: tuple[JudgedClaim, ...] = ()
+    scores: Scores = frozenset()
     printed: float | None = None
+    as_printed: bool | None = None
     exploration: Verdict | None = None
     confirmation: Verdict | None = None
-    scores: Scores = frozenset()
+    rows: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+    complete: bool = False
+    reason: str = ""
+    images: str = ""
+    scale: str = ""
+    of_paper: bool = False
+    is_level: bool = False
+    same_as: str = ""
+    warnings: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict | None:
@@ -75,43 +103,6 @@ class Judged:
         if low <= 0 <= high or self.printed * (low + high) > 0:
             return "larger" if min(abs(low), abs(high)) > abs(self.printed) else "smaller"
         return "other sign"
-
-
-@dataclass(frozen=True, kw_only=True)
-class JudgedClaim(Judged):
-    """A claim with its verdict, and what the verdict is about.
-
-    Attributes:
-        table: its name, e.g. "spatialseg/table3".
-        contrasts: those of different runs, in the order of the claim, each judged by itself.
-        as_printed: whether the printed values agree with the claim; None: some are missing.
-        rows: labels of the rows that it is about, in the order of the table.
-        missing: those without a finished run.
-        complete: whether every contrast of it could be computed.
-        reason: why there is no verdict, or why it is open; one sentence, or "".
-        images: "synthetic scenes", "real images of mfnet", ...; of several kinds all; "": no runs.
-        scale: of the runs, in the same way.
-        of_paper: whether the runs are the paper's: scale=paper, real images, no changed setting.
-        is_level: whether it is about how high a score is.
-        same_as: the claim before it that is about the same runs, "".
-        warnings: rows of different lists; rows of one seed that were trained on different machines;
-            rows that are the same runs.
-    """
-
-    table: str
-    claim: Claim
-    contrasts: tuple[Judged, ...] = ()
-    as_printed: bool | None = None
-    rows: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-    complete: bool = False
-    reason: str = ""
-    images: str = ""
-    scale: str = ""
-    of_paper: bool = False
-    is_level: bool = False
-    same_as: str = ""
-    warnings: tuple[str, ...] = ()
 
     @property
     def wanted(self) -> Range:

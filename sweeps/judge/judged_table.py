@@ -31,7 +31,7 @@ from sweeps.judge.contrasts import (
     is_level,
     printed_values,
 )
-from sweeps.judge.judged_claim import Judged, JudgedClaim, are_of_paper
+from sweeps.judge.judged_claim import JudgedClaim, are_of_paper
 from sweeps.judge.seeds import CONFIRMING, EXPLORING, of_declared, of_others, scores_of
 from sweeps.plan.claim import HIGHER, LOWER, Claim
 from sweeps.plan.request import RowSeed, TableRequest
@@ -212,13 +212,13 @@ class JudgedTable:
 
         A contrast without scores leaves a claim about all of them open.
         """
-        singles: list[Judged] = []
+        singles: list[JudgedClaim] = []
         evidences: list[BothSeeds] = []
         reasons, same = [], []
         lost = ""
         for group in groups:
             try:
-                single, terms = self._contrast(judged.claim, group)
+                single, terms = self._contrast(judged, group)
             except InputError as error:
                 reasons.append(str(error))
                 lost = lost or f"Some rows have no score: {error}"
@@ -287,8 +287,10 @@ class JudgedTable:
                     starts.add(self.reader.origin(run).start)
         return len(starts)
 
-    def _contrast(self, claim: Claim, group: Sequence[Contrast]) -> tuple[Judged, list[Term]]:
-        """The mean of contrasts beside the printed one; InputError: `terms`, or equal runs."""
+    def _contrast(
+        self, judged: JudgedClaim, group: Sequence[Contrast]
+    ) -> tuple[JudgedClaim, list[Term]]:
+        """The claim about the mean of a group alone; InputError: `terms`, or equal runs."""
         terms: list[Term] = []
         for contrast in group:
             of_contrast = self.terms(contrast.cells)
@@ -300,9 +302,10 @@ class JudgedTable:
         values = printed_values(self.request.table)
         label = group[0].label if len(group) == 1 else f"mean of {len(group)} contrasts"
         # Claims that A is above B and that B is below A are one.
-        sign = -1.0 if claim.expected == "lower" else 1.0
+        sign = -1.0 if judged.claim.expected == "lower" else 1.0
         printed = _mean([contrast.of_values(values) for contrast in group])
-        return Judged(label=label, printed=printed, scores=scores_of(terms, sign)), terms
+        scores = scores_of(terms, sign)
+        return replace(judged, label=label, printed=printed, scores=scores), terms
 
     def _evidences(self, claim: Claim, terms: Sequence[Term]) -> tuple[BothSeeds, str]:
         """The evidence of the other seeds and of the declared ones; why the first is missing."""
@@ -387,10 +390,8 @@ class JudgedTable:
                 evidence = self.resampler().evidence(used)
             except InputError:
                 return []
-            if (
-                decide([evidence], wanted, CONFIRMING if fixed else EXPLORING, "all").kind
-                != "holds"
-            ):
+            rule = CONFIRMING if fixed else EXPLORING
+            if decide([evidence], wanted, rule, "all").kind != "holds":
                 return []
         return same if len(same) < len(means) else []
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable
-from sweeps.judge.agreement import Agreement
 from sweeps.show.figure import OURS, PUBLISHED
 
 if TYPE_CHECKING:
@@ -22,27 +20,29 @@ LETTERS = 58
 LINEAR = 1.0
 
 
-def signs_in_words(agreements: Sequence[Agreement]) -> list[str]:
+def signs_in_words(signs: pd.DataFrame) -> list[str]:
     """Say of how many contrasts the sign is the printed one, a sentence for each kind of runs."""
     sentences = []
-    for found in agreements:
-        share = f"{100 * found.alike / found.contrasts:.0f} %"
-        if not math.isnan(found.low):
-            share += f" [{100 * found.low:.0f}, {100 * found.high:.0f}]"
+    for _, found in signs.iterrows():
+        share = f"{100 * found['alike'] / found['contrasts']:.0f} %"
+        if not math.isnan(found["low"]):
+            share += f" [{100 * found['low']:.0f}, {100 * found['high']:.0f}]"
         sentences.append(
-            f"on {found.images} at scale={found.scale}, {found.alike} of {found.contrasts} "
-            f"contrasts have the printed sign, {share}, where chance gives 50 %; of those whose "
-            f"interval excludes 0, {found.decided_alike} of {found.decided}"
+            f"on {found['images']} at scale={found['scale']}, {found['alike']} of "
+            f"{found['contrasts']} contrasts have the printed sign, {share}, where chance gives "
+            f"50 %; of those whose interval excludes 0, {found['decided_alike']} of "
+            f"{found['decided']}"
         )
     return sentences
 
 
-def agreement_lines(agreements: Sequence[Agreement], ranks: pd.DataFrame) -> list[str]:
+def agreement_lines(signs: pd.DataFrame, ranks: pd.DataFrame) -> list[str]:
     """Say how far results foretell the printed ones, two sentences for each kind of runs."""
     lines = []
-    for found, sentence in zip(agreements, signs_in_words(agreements), strict=True):
+    for (_, found), sentence in zip(signs.iterrows(), signs_in_words(signs), strict=True):
         line = f"{sentence[:1].upper()}{sentence[1:]}."
-        own = ranks[(ranks["images"] == found.images) & (ranks["scale"] == found.scale)]
+        is_own = (ranks["images"] == found["images"]) & (ranks["scale"] == found["scale"])
+        own = ranks[is_own]
         if len(own):
             above, below = int((own["low"] > 0).sum()), int((own["high"] < 0).sum())
             line += (

@@ -20,7 +20,7 @@ from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
-from sweeps.judge.agreement import agreements_of, contrasts_frame, ranks_of
+from sweeps.judge.agreement import contrasts_frame, ranks_of, signs_of
 from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.stored_tables import judged_tables, known_tables
 from sweeps.plan.planner import Planner
@@ -86,7 +86,7 @@ class Report:
         self.every = claims_of(self.tables)
         were_run = [section.judged for section in self.tables if section.is_run]
         self.contrasts, self.ranks = contrasts_frame(were_run), ranks_of(were_run)
-        self.agreement = agreement_lines(agreements_of(self.contrasts), self.ranks)
+        self.agreement = agreement_lines(signs_of(self.contrasts), self.ranks)
         self.claims = self._decisive_claims()
         self.data = runs_section(self.runs, self.reader, self.remarks)
         self.papers = self._papers()
@@ -241,7 +241,7 @@ class Report:
     def _number(self, mark: str) -> str:
         """What a mark names."""
         if mark == "signs":
-            return " ".join(signs_in_words(agreements_of(self.contrasts)))
+            return " ".join(signs_in_words(signs_of(self.contrasts)))
         if mark == "count runs":
             return str(len(self.runs))
         if mark == "count":

@@ -15,7 +15,7 @@ from rgbt.runs.folder import GROUP
 from rgbt.runs.provenance import commit_of
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
-from sweeps.judge.agreement import agreements_of
+from sweeps.judge.agreement import signs_of
 from sweeps.judge.effects import effects_of
 from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.judged_table import JudgedTable
@@ -132,7 +132,7 @@ def paper_section(
         "counted": counted(frame),
         "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
         "not_run": "\n".join(lines[~is_run]),
-        "agreement": agreement_lines(agreements_of(of_paper), of_tables),
+        "agreement": agreement_lines(signs_of(of_paper), of_tables),
         "forest": forest,
         "picture": f"{name}_contrasts.svg" if forest is not None else "",
     }

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sweeps.judge.agreement import agreements_of, contrasts_frame, rank_correlations, ranks_of
+from sweeps.judge.agreement import SIGNS, contrasts_frame, rank_correlations, ranks_of, signs_of
 from sweeps.judge.judged_table import JudgedTable
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Column, Row
@@ -16,11 +16,12 @@ from tests.sweeps.judge.accuracies import judged, planted
 from tests.sweeps.tabled import table
 
 SHARES = {"a": (50.0, 51.0, 50.5), "b": (60.0, 61.0, 60.5), "c": (80.0, 81.0, 80.5)}
-PRINTED = {"a": 50.0, "b": 53.0, "c": 52.0}
+PRINTED = {"a": 50.0, "b": 53.0, "c": 52.0, "d": 52.0}
 
 
 def made(name: str, shares: dict[str, tuple[float, ...]]) -> JudgedTable:
-    """A table whose printed order is a, c, b."""
+    """A table whose printed order is a, c or d, b."""
+    last = list(shares)[-1]
     rows = tuple(
         Row(label=label, experiment="crm", values={"mIoU": PRINTED[label]}) for label in shares
     )
@@ -34,7 +35,7 @@ def made(name: str, shares: dict[str, tuple[float, ...]]) -> JudgedTable:
             columns=("mIoU",),
             expected="higher",
         )
-        for row, other in (("b", "a"), ("a", "b"), ("b", "c"), ("c", "a"))
+        for row, other in (("b", "a"), ("a", "b"), ("b", last), (last, "a"))
     )
     column = Column(name="mIoU", metric="mIoU")
     given = table(rows, (column,), claims=claims, confirm=(0, 1, 2))
@@ -59,8 +60,8 @@ def test_ranks_of_tables_and_their_interval() -> None:
     noisy = {**SHARES, "b": (90.0, 40.0, 80.0)}
     (row,) = ranks_of([made("p/one", noisy)]).to_dict("records")
     assert row["low"] < 0.5 < row["high"]
-    twins = {"a": SHARES["a"], "b": SHARES["b"]}
-    assert ranks_of([made("p/one", twins)]).empty, "two rows are always ranked alike or opposite"
+    twins = {"a": SHARES["a"], "b": SHARES["b"], "c": ()}
+    assert ranks_of([made("p/one", twins)]).empty, "two rows are ranked alike or opposite"
     single = {label: shares[:1] for label, shares in SHARES.items()}
     (row,) = ranks_of([made("p/one", single)]).to_dict("records")
     assert math.isnan(row["low"])
@@ -71,14 +72,16 @@ def test_signs_of_different_contrasts_are_counted_once() -> None:
     first = made("p/one", SHARES)
     contrasts = contrasts_frame([first])
     assert contrasts["claim"].tolist() == ["b above a", "b above c", "c above a"]
-    (found,) = agreements_of(contrasts)
-    assert (found.alike, found.contrasts, found.decided_alike, found.decided) == (2, 3, 2, 3)
-    assert math.isnan(found.low), "one table has no spread over tables"
-    other = {**SHARES, "c": (10.0, 11.0, 10.5)}
-    both = contrasts_frame([first, made("p/two", other)])
-    # The second table has the same runs of a and b, and its own of c.
-    assert len(both) == 3 + (0 if contrasts.empty else 0) or len(both) > 3
-    lines = agreement_lines(agreements_of(both), ranks_of([first]))
+    (found,) = signs_of(contrasts).to_dict("records")
+    assert [found[key] for key in SIGNS[2:4] + SIGNS[6:]] == [2, 3, 2, 3]
+    assert math.isnan(found["low"]), "one table has no spread over tables"
+    # In another table d scores lowest; its runs of a and b are those of the first.
+    shares = {"a": SHARES["a"], "b": SHARES["b"], "d": (10.0, 11.0, 10.5)}
+    both = contrasts_frame([first, made("p/two", shares)])
+    (found,) = signs_of(both).to_dict("records")
+    assert (found["alike"], found["contrasts"]) == (3, 5)
+    assert found["low"] <= 3 / 5 <= found["high"]
+    lines = agreement_lines(signs_of(both), ranks_of([first]))
     assert "contrasts have the printed sign" in lines[0]
     assert "0 below" in lines[0]
 

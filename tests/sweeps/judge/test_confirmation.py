@@ -11,7 +11,7 @@ import pytest
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.intervals import Interval
 from analysis.uncertainty.verdicts import Verdict
-from sweeps.judge.judged_claim import Judged, JudgedClaim, are_of_paper
+from sweeps.judge.judged_claim import JudgedClaim, are_of_paper
 from sweeps.plan.claim import Claim
 from sweeps.plan.request import RowSeed
 from sweeps.plan.table import Column, Row
@@ -166,7 +166,9 @@ def test_size_is_our_interval_beside_the_printed_value(
         seeds_needed=4,
         decisive=0,
     )
-    found = Judged(label="a - b", printed=printed, confirmation=verdict)
+    found = JudgedClaim(
+        table="t", claim=claim(), label="a - b", printed=printed, confirmation=verdict
+    )
     assert found.size == word
     blind = replace(verdict, interval=None, smallest=math.nan)
     assert replace(found, confirmation=blind).size == ""
