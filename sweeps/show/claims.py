@@ -246,7 +246,8 @@ def statement(row: pd.Series) -> str:
     text = f"{row['says']} **{word.capitalize()}**{where}: "
     text += f"{_signed(row['estimate'])} {_interval(row)}"
     if row["size"]:
-        text += f", printed {_signed(row['printed'])} ({row['size']})"
+        than = "" if row["size"] == "as printed" else " than printed"
+        text += f", {row['size']}{than} ({_signed(row['printed'])})"
     return f"{text}; {_rests_on(row)}."
 
 
