@@ -65,12 +65,13 @@ STATED = {
     "mvseg": """
         0 background (0,0,0), 1 car (0,0,142), 2 bus (0,60,100), 3 motorcycle (0,0,230),
         4 bicycle (119,11,32), 5 pedestrian (255,0,0), 6 motorcyclist (0,139,139),
-        7 bicyclist (255,165,150), 8 cart (192,64,0), 9 bench (211,211,211), 10 umbrella (100,33,128),
-        11 box (117,79,86), 12 pole (153,153,153), 13 street_lamp (190,122,222),
-        14 traffic_light (250,170,30), 15 traffic_sign (220,220,0), 16 car_stop (222,142,35),
-        17 color_cone (205,155,155), 18 sky (70,130,180), 19 road (128,64,128),
-        20 sidewalk (244,35,232), 21 curb (0,0,70), 22 vegetation (107,142,35),
-        23 terrain (152,251,152), 24 building (70,70,70), 25 ground (110,80,100)""",
+        7 bicyclist (255,165,150), 8 cart (192,64,0), 9 bench (211,211,211),
+        10 umbrella (100,33,128), 11 box (117,79,86), 12 pole (153,153,153),
+        13 street_lamp (190,122,222), 14 traffic_light (250,170,30), 15 traffic_sign (220,220,0),
+        16 car_stop (222,142,35), 17 color_cone (205,155,155), 18 sky (70,130,180),
+        19 road (128,64,128), 20 sidewalk (244,35,232), 21 curb (0,0,70),
+        22 vegetation (107,142,35), 23 terrain (152,251,152), 24 building (70,70,70),
+        25 ground (110,80,100)""",
 }
 
 
