@@ -193,6 +193,9 @@ def test_confidences_and_error_of_six_pixels_by_hand() -> None:
     # Predicted 1: |1 - 0.5| + |1 - 1.55| over 3 pixels.
     assert ece(found[..., 1:]) == pytest.approx((0.5 + 0.55) / 3)
     assert np.isnan(ece(np.zeros((15, 3, 2), np.int64)))
+    # A confidence of 0.12346 is 1235 units.
+    found = counted(Details("calibration", (2.0,)), [[0]], [[0]], [[0.12346]])
+    assert found[0].tolist() == [[1, 0], [1, 0], [1235, 0]]
 
 
 @pytest.mark.parametrize(
