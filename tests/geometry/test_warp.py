@@ -111,12 +111,16 @@ def test_bilinear_is_the_slow_one_and_has_its_gradient(resampling: Resampling) -
     assert torch.autograd.gradcheck(warp.bilinear, (values[:, :2].clone().requires_grad_(),))
 
 
-def test_once_repeats_the_border_and_twice_fades_it_out() -> None:
-    ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
-    once, twice = (Warp(right, whole((4, 6)), (4, 6), resampling) for resampling in RESAMPLINGS)
-    # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
-    assert once.bilinear(ones)[0, 0, 0].tolist() == [1, 1, 1, 1, 1, 1]
-    assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
+@pytest.mark.parametrize(("x", "y"), [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+def test_once_repeats_the_border_and_twice_fades_it_out(x: float, y: float) -> None:
+    """At each side: the outline itself, half a pixel from the first centre, is 0.5 with zeros."""
+    ones, moved = torch.ones(1, 1, 4, 6), shift(x, y)
+    once, twice = (Warp(moved, whole((4, 6)), (4, 6), resampling) for resampling in RESAMPLINGS)
+    assert torch.equal(once.bilinear(ones), ones)
+    faded = ones[0, 0].clone()
+    lines = faded if y else faded.T
+    lines[0 if x + y > 0 else -1] = 0.5
+    assert torch.equal(twice.bilinear(ones)[0, 0], faded)
 
 
 def test_normalised_edges_and_centres_by_hand() -> None:
