@@ -163,6 +163,22 @@ def test_resized_warp_is_warp_by_the_resized_camera() -> None:
     assert resized.image_hw == small
 
 
+def test_a_warp_of_another_aspect_by_hand() -> None:
+    """Twice the columns, half of the rows: an edge e becomes (e + 0.5) s - 0.5, a shift s times."""
+    cut = torch.tensor([[2.5, 0.5, 7.5, 6.5]], dtype=torch.float64)
+    found = Warp(shift(4.5, -2), cut, (10, 12), "once").resized((5, 24))
+    assert found.rectangle.tolist() == [[5.5, 0.0, 15.5, 3.0]]
+    torch.testing.assert_close(found.homography, shift(9, -1))
+
+
+def test_nearest_between_two_pixels_takes_the_second() -> None:
+    """x = -0.5, 0.5, ...: in each pair of pixels the right one, and the lower one."""
+    label = torch.arange(24).view(1, 4, 6)
+    for x, y in ((0.5, 0), (0, 0.5)):
+        warp = Warp(shift(x, y), whole((4, 6)), (4, 6), "once")
+        assert torch.equal(warp.nearest(label, 255), label)
+
+
 def test_a_resized_cut_may_begin_within_a_pixel() -> None:
     """Columns 3..7 and rows 1..6 of 8, cut twice: at half the size they begin at 1.5 and 0.5."""
     cut = torch.tensor([[2.5, 0.5, 7.5, 6.5]], dtype=torch.float64)

@@ -230,6 +230,7 @@ def test_values_of_deeplab_equal_a_second_computation(
     changes: dict[str, Any], rates: tuple[int, ...], size: tuple[int, int]
 ) -> None:
     net = nano("deeplabv2", **changes, summed_rates=rates).eval()
+    assert len(net.heads["source"]["aspp"].conv2d_list) == 4, "others belong to the parameters"
     randomise(net)
     rgb, thermal = images(2, *size)
     for view, head in (("rgb", "source"), ("thermal", "target")):
@@ -238,6 +239,16 @@ def test_values_of_deeplab_equal_a_second_computation(
         ceil, corners = (changes.get(name, True) for name in ("ceil_mode", "align_corners"))
         expected = deeplabv2(net, 2 * image - 1, head, rates, ceil=ceil, corners=corners)
         check(found, expected)
+
+
+@pytest.mark.parametrize("corners", [False, True])
+@torch.no_grad()
+def test_the_critic_enlarges_its_verdicts(corners: bool) -> None:
+    maps = normal(1, 2, 64, 96)
+    small = nano("critic")(maps)
+    assert small.shape == (1, 1, 2, 3)
+    found = nano("critic", upsample=True, align_corners=corners)(maps)
+    torch.testing.assert_close(found, bilinear(small, (64, 96), corners=corners))
 
 
 @pytest.mark.parametrize(("name", "changes"), CASES)

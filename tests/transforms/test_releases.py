@@ -233,6 +233,8 @@ STEPS = {
 }
 ROTATING = ("semseg", "heatnet")
 WORDS = {
+    # The mean of thermal and two of the three colours are rounded up.
+    "cmx_released": ("transform.padding_thermal=[100.0,102.0,103.0]",),
     # Truncation after a float32 resize shows its last bit: no colours there, see test_crm.
     "crm_released": ("transform.colour_probability=0",),
     "semseg": ("model=semseg",),
