@@ -72,7 +72,8 @@ def test_draws_have_their_ranges_and_odds() -> None:
     pair = np.array([[0, 100]], np.uint8)
     same = crm(colour_probability=0.0).coloured(grey, pair, rng)
     assert (same[0].tolist(), same[1].tolist()) == (grey.tolist(), pair.tolist())
-    still: dict[str, Any] = {"colour_probability": 1.0, "brightness_delta": 0.0}
+    still: dict[str, Any] = {"colour_probability": 1.0, "flip_probability": 0.0}
+    still |= {"brightness_delta": 0.0}
     still |= {"contrast_range": (1, 1), "saturation_range": (1, 1), "hue_delta": 0}
     for changes, expected in (
         ({"brightness_delta": 32.0}, (68, 131)),

@@ -46,11 +46,13 @@ def test_changes_of_one_pixel() -> None:
 
 
 def test_levels_saturation_and_hue_are_rounded() -> None:
-    """Level 100.7 is 101; S = 0.9 * 204 = 183.6 is 184; a hue of 5.67 steps is 6, 12 degrees."""
+    """Level 100.7 is 101; S = 0.9 * 204 = 183.6 is 184, thus 220 (1 - S / 255) = 61.25; a hue of
+    5.67 steps is 6, thus 12 degrees.
+    """
     for before, change, value, after in (
-        ((100.7, 100.7, 100.7), "saturation", 0.0, (101, 101, 101)),
-        ((255.0, 51.0, 51.0), "saturation", -0.1, (255, 255 - 184, 255 - 184)),
-        ((255.0, 0.0, 0.0), "hue", 5.67 / 180, (255, 255 * 12 / 60, 0)),
+        ((100.7, 100.7, 100.7), "saturation", 0.0, (101.0, 101.0, 101.0)),
+        ((220.0, 44.0, 44.0), "saturation", -0.1, (220.0, 61.0, 61.0)),
+        ((255.0, 0.0, 0.0), "hue", 5.67 / 180, (255.0, 255 * 12 / 60, 0.0)),
     ):
         found = jittered(pixel(*before) / 255, change, by(value))
         torch.testing.assert_close(255 * found, pixel(*after), atol=0.01, rtol=0)
