@@ -99,6 +99,7 @@ def test_both_protocols_of_fmb(tmp_path: Path) -> None:
         write_pair(*places, number)
     with_background, without = opened("fmb", tmp_path), opened("fmb_14", tmp_path)
     assert not check_dataset(with_background).problems
+    assert (with_background.background, with_background.unscored) == (("background",), ())
     assert with_background.names("val") == with_background.names("test") == ("test_00003",)
     assert (with_background.classes[14], without.classes[13]) == ("pole", "pole")
     assert with_background.palette[14] == without.palette[13] == (90, 113, 135)
