@@ -10,7 +10,7 @@ import yaml
 from omegaconf import DictConfig
 
 from rgbt.config.component import Component
-from rgbt.config.compose import available, compose, conf_dir
+from rgbt.config.compose import available, compose, conf_dir, load_choice
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.files.adapters import adapter_of
 from rgbt.models.external.network import ExternalNetwork
@@ -66,3 +66,19 @@ def test_recipe_has_keys_that_differ_and_states_its_source(name: str) -> None:
     assert re.search(r"Commit: [0-9a-f]{8} \(20\d\d-\d\d-\d\d\)\. Licence: ", head)
     assert re.search(r"Licence: .*?\. Lists: (trained on|not checked)", head)
     assert re.search(r"[\d,]{9,} parameters at (nine|five) classes", head)
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "deviation"),
+    [("imagenet_449", 0.449, 0.226), ("dformer", 0.48, 0.28), ("unit_three", 0.0, 1.0)],
+)
+def test_inputs_have_the_constants_of_the_releases(
+    name: str, mean: float, deviation: float
+) -> None:
+    """Of thermal as the code of EGFNet and DFormer states them, of RGB those of ImageNet."""
+    node = load_choice(f"model/inputs/{name}")
+    assert node["thermal_mean"] == pytest.approx([255 * mean] * 3)
+    assert node["thermal_std"] == pytest.approx([255 * deviation] * 3)
+    if name == "imagenet_449":
+        assert node["rgb_mean"] == pytest.approx([255 * share for share in (0.485, 0.456, 0.406)])
+        assert node["rgb_std"] == pytest.approx([255 * share for share in (0.229, 0.224, 0.225)])

@@ -136,6 +136,24 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
     assert archived(archive) == [archive / f"{run.key}.zip", other]  # the first is read
 
 
+@pytest.mark.parametrize("name", ["rgb", "aligned3"])
+def test_one_pixel_of_any_counts_makes_other_results(
+    run: RunResult, tmp_path: Path, name: str
+) -> None:
+    """Predicted as the class 1 instead of 0. The counts of the run's own test stay the same."""
+    path = run.folder / f"evaluations/test_{name}.npz"
+    stored = Counts.load(path)
+    counts = stored.counts.copy()
+    counts[0, 0, 1] += [-1, 1] + [0] * (counts.shape[-1] - 2)
+    replace(stored, counts=counts).save(path)
+    first = archived_in(tmp_path)
+    other = add(run, tmp_path / "results")
+    assert archived(tmp_path / "results") == [first, other]
+    changed, unpacked = f"evaluations/{path.name}", tmp_path / "unpacked"
+    for file, expected in ((first, stored.counts), (other, counts)):
+        assert np.array_equal(unpack(file, unpacked).counts(changed).counts, expected)
+
+
 def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> None:
     wrong = some(0).counts.copy()
     wrong[..., 0, 1] += 1  # another prediction of a pixel with the same label

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import compose
+from rgbt.config.compose import compose, load_choice
 from rgbt.data.check import check_dataset
+from rgbt.data.labels import label_codes
 from rgbt.data.mfnet import MFNet
 from rgbt.runs.folder import lists_of
+from rgbt.types import IGNORE
 from tests.conftest import write_png
 
 HW = (4, 6)
@@ -38,6 +41,55 @@ def write_pair(rgb: Path, thermal: Path, label: Path, value: int) -> None:
     write(label, np.full(HW, value, np.uint8))
 
 
+# Label values as the releases state them, with the colours of the classes; -: not counted.
+MFNET = """
+0 unlabeled (0,0,0), 1 car (64,0,128), 2 person (64,64,0), 3 bike (0,128,192), 4 curve (0,0,192),
+5 car_stop (128,128,0), 6 guardrail (64,64,128), 7 color_cone (192,128,128), 8 bump (192,64,0)"""
+FMB = """
+1 road (228,228,179), 2 sidewalk (133,57,181), 3 building (177,162,67), 4 lamp (50,178,200),
+5 sign (199,45,132), 6 vegetation (84,172,66), 7 sky (79,73,179), 8 person (166,99,76),
+9 car (253,121,66), 10 truck (91,165,137), 11 bus (152,97,155), 12 motorcycle (140,153,105),
+13 bicycle (158,215,222), 14 pole (90,113,135)"""
+STATED = {
+    "fmb": "0 background (0,0,0)," + FMB,  # repositories that train on FMB
+    "fmb_14": "0 -," + FMB,
+    "msrs": MFNET,  # its labels are those of MFNet
+    "video": re.sub(r" \([\d,]+\)", "", MFNET),
+    "semanticrt": """
+        0 background, 1 car_stop, 2 bike, 3 bicyclist, 4 motorcycle, 5 motorcyclist, 6 car,
+        7 tricycle, 8 traffic_light, 9 box, 10 pole, 11 curve, 12 person""",
+    "cart": """
+        0 -, 1 -, 2 bare_ground (242,216,196), 3 rocky_terrain (89,70,54),
+        4 structures (166,166,166), 5 road (82,89,90), 6 shrubs (155,230,0), 7 trees (0,138,53),
+        8 sky (0,216,245), 9 water (13,127,252), 10 vehicles (255,249,0), 11 person (254,0,170)""",
+    "mvseg": """
+        0 background (0,0,0), 1 car (0,0,142), 2 bus (0,60,100), 3 motorcycle (0,0,230),
+        4 bicycle (119,11,32), 5 pedestrian (255,0,0), 6 motorcyclist (0,139,139),
+        7 bicyclist (255,165,150), 8 cart (192,64,0), 9 bench (211,211,211),
+        10 umbrella (100,33,128), 11 box (117,79,86), 12 pole (153,153,153),
+        13 street_lamp (190,122,222), 14 traffic_light (250,170,30), 15 traffic_sign (220,220,0),
+        16 car_stop (222,142,35), 17 color_cone (205,155,155), 18 sky (70,130,180),
+        19 road (128,64,128), 20 sidewalk (244,35,232), 21 curb (0,0,70),
+        22 vegetation (107,142,35), 23 terrain (152,251,152), 24 building (70,70,70),
+        25 ground (110,80,100)""",
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_label_values_have_the_stated_classes(name: str) -> None:
+    node = load_choice(f"dataset/{name}")
+    classes, ids, ignored = node["classes"], node.get("ids"), node.get("ignored", ())
+    stated = re.findall(r"(\d+) ([\w-]+)(?: \(([\d,]+)\))?", STATED[name])
+    values = np.array([int(value) for value, _, _ in stated], np.uint8)
+    read = label_codes(classes, ids, None, ignored).classes(values, Path(name)).tolist()
+    found = ["-" if index == IGNORE else classes[index] for index in read]
+    assert found == [word for _, word, _ in stated]
+    assert len(classes) == node["num_classes"] == len(found) - found.count("-")
+    colours = {word: colour for _, word, colour in stated if colour}
+    for word, colour in zip(classes, node["palette"] if colours else (), strict=bool(colours)):
+        assert ",".join(map(str, colour)) == colours[word], word
+
+
 def test_both_protocols_of_fmb(tmp_path: Path) -> None:
     for part, number in (("train", 14), ("train", 0), ("test", 3)):
         places = [
@@ -47,6 +99,7 @@ def test_both_protocols_of_fmb(tmp_path: Path) -> None:
         write_pair(*places, number)
     with_background, without = opened("fmb", tmp_path), opened("fmb_14", tmp_path)
     assert not check_dataset(with_background).problems
+    assert (with_background.background, with_background.unscored) == (("background",), ())
     assert with_background.names("val") == with_background.names("test") == ("test_00003",)
     assert (with_background.classes[14], without.classes[13]) == ("pole", "pole")
     assert with_background.palette[14] == without.palette[13] == (90, 113, 135)

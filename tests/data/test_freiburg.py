@@ -172,7 +172,8 @@ def test_fingerprint_is_of_labels_too(sound: Path) -> None:
 
 
 def test_sequences_that_are_held_out(sound: Path, tmp_path: Path) -> None:
-    dataset = Freiburg(str(sound), crop=CROP)
+    dataset = Freiburg(str(sound), crop=CROP, background=("background",))
+    assert (dataset.background, len(dataset.unscored)) == (("background",), 2)
     assert len(dataset.names("train_day")) == len(dataset.names("train")) == 5
     assert not dataset.has("val")
     assert "dataset.val_sequences" in refused(lambda: dataset.names("val"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,15 @@ from rgbt.data.check import check_dataset
 from rgbt.data.mfnet import MFNet
 from rgbt.data.video import FramesInOrder, MVSeg, consecutive, sequences_of_names
 from tests.conftest import write_data, write_png
-from tests.data.layouts import of_mvseg, of_video, refused, video, write_mvseg, write_videos
+from tests.data.layouts import (
+    CLASSES,
+    of_mvseg,
+    of_video,
+    refused,
+    video,
+    write_mvseg,
+    write_videos,
+)
 
 HW = (32, 48)
 
@@ -107,7 +116,9 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
         rgb, thermal, _ = of_video(str(number))
         write_png(tmp_path / "drive" / f"frame_{number}.png", np.dstack([rgb, thermal]))
     packed = "frame_{name}.png"
-    dataset = video(tmp_path / "drive", rgb=packed, thermal=packed, label=None, lists=None)
+    means: dict[str, Any] = {"background": CLASSES[:1], "unscored": CLASSES[1:]}
+    dataset = video(tmp_path / "drive", rgb=packed, thermal=packed, label=None, lists=None, **means)
+    assert {name: getattr(dataset, name) for name in means} == means
     assert dataset.names("test") == dataset.sequences("test")[0] == ("9", "10", "11")
     np.testing.assert_array_equal(dataset.read("10").thermal, of_video("10")[1])
     assert dataset.nights(("9",)) is None

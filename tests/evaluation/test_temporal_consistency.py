@@ -23,6 +23,7 @@ from rgbt.data.mfnet import NextFrames
 from rgbt.evaluation.measure import measurement_of
 from rgbt.evaluation.pairs.count import (
     CountedPairs,
+    _picture,
     consistency_table,
     consistency_values,
     count_pairs,
@@ -38,6 +39,12 @@ from tests.commands import SPLITS, words_of
 from tests.conftest import write_png
 
 HW = (48, 64)
+
+
+def test_pictures_are_enlarged_between_the_centres_of_their_pixels() -> None:
+    """255 times 0, 1/4, 3/4, 1, rounded."""
+    found = _picture(torch.tensor([0.0, 1.0]).expand(3, 1, 2), (2, 4))
+    assert found.tolist() == [[[level] * 3 for level in (0, 64, 191, 255)]] * 2
 
 
 def one_hot(classes: Tensor) -> Output:

@@ -45,6 +45,15 @@ def test_a_principal_point_outside_the_image_is_refused(changed: dict[str, float
         Camera(**{**SMALL, **changed})
 
 
+def test_the_principal_point_may_lie_on_the_edge_of_the_image() -> None:
+    """Of 48 x 64 pixels, whose centres lie at whole numbers."""
+    for cx, cy in ((63.5, 47.5), (-0.5, -0.5)):
+        assert Camera(**{**SMALL, "cx": cx, "cy": cy}).matrix((48, 64))[0, 2] == cx
+    for changed in ({"cx": 63.6}, {"cy": 47.6}):
+        with pytest.raises(InputError, match="camera: the principal point"):
+            Camera(**{**SMALL, **changed})
+
+
 # ---- homographies ---------------------------------------------------------------------------
 
 

@@ -69,6 +69,19 @@ def test_disagreement_by_hand() -> None:
     assert (disagreement(flow, back)[:, :4] == 0).all()
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("line", "sign"), [(0, -1), (-1, 1)])
+def test_points_up_to_half_a_pixel_outside_belong_to_the_border(
+    axis: int, line: int, sign: int
+) -> None:
+    for moved, inside in ((0.4, True), (0.6, False)):
+        flow = np.zeros((4, 6, 2), np.float32)
+        flow[..., axis] = sign * moved
+        error = np.isfinite(disagreement(flow, -flow)).swapaxes(0, axis)
+        assert (error[line] == inside).all()
+        assert np.delete(error, line, 0).all()
+
+
 def test_source_by_hand() -> None:
     flow = np.array([[[0.4, 1.0], [1.0, -1.2]]], np.float32).repeat(2, 0)
     used = np.array([[True, True], [True, False]])

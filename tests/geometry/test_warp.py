@@ -111,12 +111,16 @@ def test_bilinear_is_the_slow_one_and_has_its_gradient(resampling: Resampling) -
     assert torch.autograd.gradcheck(warp.bilinear, (values[:, :2].clone().requires_grad_(),))
 
 
-def test_once_repeats_the_border_and_twice_fades_it_out() -> None:
-    ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
-    once, twice = (Warp(right, whole((4, 6)), (4, 6), resampling) for resampling in RESAMPLINGS)
-    # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
-    assert once.bilinear(ones)[0, 0, 0].tolist() == [1, 1, 1, 1, 1, 1]
-    assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
+@pytest.mark.parametrize(("x", "y"), [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+def test_once_repeats_the_border_and_twice_fades_it_out(x: float, y: float) -> None:
+    """At each side: the outline itself, half a pixel from the first centre, is 0.5 with zeros."""
+    ones, moved = torch.ones(1, 1, 4, 6), shift(x, y)
+    once, twice = (Warp(moved, whole((4, 6)), (4, 6), resampling) for resampling in RESAMPLINGS)
+    assert torch.equal(once.bilinear(ones), ones)
+    faded = ones[0, 0].clone()
+    lines = faded if y else faded.T
+    lines[0 if x + y > 0 else -1] = 0.5
+    assert torch.equal(twice.bilinear(ones)[0, 0], faded)
 
 
 def test_normalised_edges_and_centres_by_hand() -> None:
@@ -157,6 +161,22 @@ def test_resized_warp_is_warp_by_the_resized_camera() -> None:
     torch.testing.assert_close(resized.homography, half)
     torch.testing.assert_close(resized.rectangle, inner_rectangle(half, small, "largest"))
     assert resized.image_hw == small
+
+
+def test_a_warp_of_another_aspect_by_hand() -> None:
+    """Twice the columns, half of the rows: an edge e becomes (e + 0.5) s - 0.5, a shift s times."""
+    cut = torch.tensor([[2.5, 0.5, 7.5, 6.5]], dtype=torch.float64)
+    found = Warp(shift(4.5, -2), cut, (10, 12), "once").resized((5, 24))
+    assert found.rectangle.tolist() == [[5.5, 0.0, 15.5, 3.0]]
+    torch.testing.assert_close(found.homography, shift(9, -1))
+
+
+def test_nearest_between_two_pixels_takes_the_second() -> None:
+    """x = -0.5, 0.5, ...: in each pair of pixels the right one, and the lower one."""
+    label = torch.arange(24).view(1, 4, 6)
+    for x, y in ((0.5, 0), (0, 0.5)):
+        warp = Warp(shift(x, y), whole((4, 6)), (4, 6), "once")
+        assert torch.equal(warp.nearest(label, 255), label)
 
 
 def test_a_resized_cut_may_begin_within_a_pixel() -> None:

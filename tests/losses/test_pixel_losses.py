@@ -283,3 +283,6 @@ def test_rows_at_the_borders_have_no_weight(weighted_by: Any) -> None:
     assert torch.equal(found.weight[:, 1:7], plain.weight[:, 1:7])
     # The share is that of all rows, as released.
     assert torch.equal(found.confident, plain.confident)
+    # Of ten rows, 0.17 are two, and 0.26 are three.
+    found = pseudo_labels(tall, 0.8, weighted_by, (0.17, 0.26))
+    assert found.weight.bool().any((0, 2)).tolist() == [False] * 2 + [True] * 5 + [False] * 3

@@ -159,6 +159,15 @@ def test_centre_and_largest_distance(changes: dict[str, str], expected: list[lis
     assert torch.allclose(weights[0, 0], 1 + torch.tensor(expected))
 
 
+def test_centre_of_an_odd_crop_is_its_middle_pixel() -> None:
+    """Of 3 x 5 pixels (1, 2), at a distance of sqrt 5 from the corners."""
+    batch = batch_of(torch.zeros(1, 3, 5, dtype=torch.long), whole_image(1, 5, 7)[:, :, 1:4, :5])
+    weights = weight_map(batch, (3, 5), replace(EDGE, alpha=1.0, centre="crop", d_max="crop"))
+    outer, middle = [1, sqrt(2 / 5), sqrt(1 / 5)], [sqrt(4 / 5), sqrt(1 / 5), 0]
+    rows = [[*row, *row[1::-1]] for row in (outer, middle, outer)]
+    assert torch.allclose(weights[0, 0], 1 + torch.tensor(rows))
+
+
 @pytest.mark.parametrize(
     ("focus", "padding", "expected"),
     [("edge", "map", 3.0), ("center", "map", 1.0), ("edge", "one", 1.0), ("edge", "zero", 0.0)],
@@ -254,7 +263,9 @@ def test_equals_the_loop_over_passes_layers_and_images(
     spatial: SpatialWeight, sizes: tuple[int, int, int]
 ) -> None:
     output, batch = problem_of(*sizes)
-    criterion = criterion_of(spatial=spatial)
+    weights = {"class_weight": 1.5, "mask_weight": 4.0, "dice_weight": 7.0}  # no two are equal
+    criterion = criterion_of(spatial=spatial, **weights, no_object_weight=0.2)
+    assert criterion.part_weights == {"class": 1.5, "mask": 4.0, "dice": 7.0}
     draws = replayed(criterion, sizes[:2], batch)
     batched = criterion.compare(output, batch, draws)
     expected = reference_criterion(criterion, output, batch, draws)

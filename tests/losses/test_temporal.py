@@ -209,6 +209,18 @@ def test_values(form: Any, frames: Any) -> None:
             assert torch.allclose(parts[f"cross_entropy_{number}"], seg)
 
 
+def test_losses_of_weight_0_are_neither_computed_nor_required(frames: Any) -> None:
+    """Without alpha no dice_1, without beta no second loss: only dice needs a background."""
+    segmentation = {"cross_entropy_1", "cross_entropy_2"}
+    for changes, own, needs in (
+        ({"alpha": 0.0, "second": "con"}, {"con"}, 1),
+        ({"beta": 0.0, "second": "none"}, {"dice_1"}, 2),
+    ):
+        loss = loss_of(form="released", **changes)
+        assert loss(*frames, NOTHING).keys() == segmentation | own
+        assert len(loss.record.requires) == len(loss_of().record.requires) - 1 + needs
+
+
 @pytest.mark.parametrize("second", ["con", "con_acc"])
 def test_full_resolution_is_compared_in_two_by_two_means(second: Any, frames: Any) -> None:
     """Frames of 6 x 7: three rows and four columns, the last one of single pixels."""

@@ -222,6 +222,18 @@ def test_fixed_count_is_drawing_one_after_the_other() -> None:
     assert share.tolist() == pytest.approx([expected[i] for i in range(3)], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("grid_hw", "ratio", "sides"),
+    [((7, 9), 0.7, (5, 6)), ((5, 3), 0.55, (3, 2)), ((9, 5), 1, (9, 5))],
+)
+def test_sides_of_squares_are_rounded_to_cells(grid_hw, ratio, sides) -> None:
+    """Of 7 x 9 cells 4.9 and 6.3, of 5 x 3 cells 2.75 and 1.65."""
+    taken = square(50, grid_hw, ratio, torch_generator(0, "t"))
+    assert taken.shape == (50, *grid_hw)
+    assert (taken.any(2).sum(1) == sides[0]).all()
+    assert (taken.any(1).sum(1) == sides[1]).all()
+
+
 def test_square_is_one_rectangle_of_half_the_sides() -> None:
     taken = square(200, (8, 10), 0.5, torch_generator(0, "t"))
     rows, columns = taken.any(2), taken.any(1)

@@ -158,6 +158,15 @@ def test_boundary_is_what_erosions_of_each_padded_mask_leave(pixels: int, border
     assert np.array_equal(outlined(blobs, every, pixels, border=border), expected)
 
 
+@pytest.mark.parametrize(("width", "pixels"), [(0.034, 2), (0.026, 1), (0.066, 3), (0.001, 1)])
+def test_width_of_boundaries_is_rounded_to_pixels(width: float, pixels: int) -> None:
+    """Of the diagonal, 50 pixels: 1.7 are two, 1.3 are one, 3.3 are three, and 0.05 are one."""
+    halves = np.zeros((30, 40), np.uint8)
+    halves[:, 20:] = 1
+    found = counted(Details("boundary", (width,)), halves, halves)
+    assert found[0].tolist() == [[30 * pixels] * 2] * 3
+
+
 def test_ignored_pixels_are_not_counted_and_are_no_outline() -> None:
     label, prediction = np.zeros((7, 7), np.uint8), np.zeros((7, 7), np.uint8)
     label[3, 3] = 255
@@ -184,6 +193,9 @@ def test_confidences_and_error_of_six_pixels_by_hand() -> None:
     # Predicted 1: |1 - 0.5| + |1 - 1.55| over 3 pixels.
     assert ece(found[..., 1:]) == pytest.approx((0.5 + 0.55) / 3)
     assert np.isnan(ece(np.zeros((15, 3, 2), np.int64)))
+    # A confidence of 0.12346 is 1235 units.
+    found = counted(Details("calibration", (2.0,)), [[0]], [[0]], [[0.12346]])
+    assert found[0].tolist() == [[1, 0], [1, 0], [1235, 0]]
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,8 @@ def test_rings_by_hand() -> None:
     expected[1:6, 1:6] = 1
     expected[2:6, 2:6] = 0
     assert np.array_equal(ring_map((8, 8), 4, "image"), expected)
+    # 11 x 19 in 5 rings: sides 11 / sqrt 5 = 4.92 and 19 / sqrt 5 = 8.50; 121 / 5 is below 25.
+    assert ring_rectangle((11, 19), 5, 1, "image") == (slice(3, 7), slice(5, 13))
 
 
 PUBLISHED = {

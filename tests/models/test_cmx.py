@@ -122,13 +122,13 @@ RAMP = ([1.0], [0.8, 0.6], [0.4], [0.2])
     [
         (
             "cmx",
-            {"drop_path_stage2": "released"},
+            {"drop_path_stage2": "released", "decoder_dropout": 0.3},
             {
                 "block": ([1.0], [0.8, 0.8], [0.4], [0.2]),
                 "extra_block": ([1.0], [0.6, 0.6], [0.4], [0.2]),
             },
         ),
-        ("cmnext", {}, {"block": RAMP, "extra_block": RAMP}),
+        ("cmnext", {"decoder_dropout": 0.3}, {"block": RAMP, "extra_block": RAMP}),
         ("mask2former", {"depths": (1, 2, 1, 1)}, dict.fromkeys(("RGB", "THR"), RAMP)),
     ],
 )
@@ -140,6 +140,8 @@ def test_rates_reach_the_blocks_of_each_stream(
     The factor of a residual is 0 or 1 / keep; samples, residuals and streams have their own draws.
     """
     net = nano(name, drop_path_rate=0.8, **changes).train()
+    if "decoder_dropout" in changes:
+        assert net.decode_head.dropout == 0.3
     seen: dict[str, Tensor] = {}
     for path, module in net.backbone.named_modules():
         if hasattr(module, "norm1") and hasattr(module, "mlp"):

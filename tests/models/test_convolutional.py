@@ -174,11 +174,13 @@ def semseg(net: Any, rgb: Tensor, thermal: Tensor) -> Found:
     return {"logits": cls, "features": x, "aux_logits": aux}
 
 
-def deeplabv2(net: Any, image: Tensor, head: str, rates: tuple[int, ...]) -> Found:
+def deeplabv2(
+    net: Any, image: Tensor, head: str, rates: tuple[int, ...], *, ceil: bool, corners: bool
+) -> Found:
     plain, hw = Plain(net.state_dict()), image.shape[2:]
     padded = F.pad(image, (0, -hw[1] % net.multiple, 0, -hw[0] % net.multiple))
     x = plain.normed("backbone.conv1", "backbone.bn1", padded, stride=2)
-    x = F.max_pool2d(x.clamp(min=0), 3, 2, 1, ceil_mode=net.multiple == 1)
+    x = F.max_pool2d(x.clamp(min=0), 3, 2, 1, ceil_mode=ceil)
     x = plain.stage("backbone.layer1", x)
     x = plain.stage("backbone.layer2", x, strides=(2, 1))
     layer3 = plain.stage("backbone.layer3", x, dilations=(2, 2))
@@ -191,13 +193,11 @@ def deeplabv2(net: Any, image: Tensor, head: str, rates: tuple[int, ...]) -> Fou
 
     scores = pyramid(f"heads.{head}.aspp", layer4)
     for index in range(len(net.heads[head].ups)):
-        scores = plain.up(f"heads.{head}.ups.{index}", scores, align_corners=False)
+        scores = plain.up(f"heads.{head}.ups.{index}", scores, align_corners=corners)
     if f"heads.{head}.final.weight" in plain.state:
         scores = plain.conv(f"heads.{head}.final", scores)
     both = {"logits": scores, "aux_logits": pyramid("auxiliary", layer3)}
-    enlarged = {
-        n: bilinear(x, padded.shape[2:], corners=net.multiple == 1) for n, x in both.items()
-    }
+    enlarged = {n: bilinear(x, padded.shape[2:], corners=corners) for n, x in both.items()}
     return {n: x[..., : hw[0], : hw[1]] for n, x in enlarged.items()} | {"features": layer4}
 
 
@@ -218,19 +218,37 @@ def test_values_of_semseg_equal_a_second_computation(modalities: str) -> None:
     check(net(rgb, thermal), semseg(net, 2 * rgb - 1, 2 * thermal - 1))
 
 
-@pytest.mark.parametrize("changes", [{}, MODIFIED, LITERAL])
+@pytest.mark.parametrize(
+    "changes",
+    # Each of the two settings alone, too.
+    [{}, MODIFIED, LITERAL, {"ceil_mode": False}, {"align_corners": False}]
+    + [LITERAL | {"align_corners": True}],
+)
 @pytest.mark.parametrize(("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (61, 83))])
 @torch.no_grad()
 def test_values_of_deeplab_equal_a_second_computation(
     changes: dict[str, Any], rates: tuple[int, ...], size: tuple[int, int]
 ) -> None:
     net = nano("deeplabv2", **changes, summed_rates=rates).eval()
+    assert len(net.heads["source"]["aspp"].conv2d_list) == 4, "others belong to the parameters"
     randomise(net)
     rgb, thermal = images(2, *size)
     for view, head in (("rgb", "source"), ("thermal", "target")):
         image = rgb if view == "rgb" else thermal.expand_as(rgb)
         found = net(rgb, thermal, views=(view,), head=head)
-        check(found, deeplabv2(net, 2 * image - 1, head, rates))
+        ceil, corners = (changes.get(name, True) for name in ("ceil_mode", "align_corners"))
+        expected = deeplabv2(net, 2 * image - 1, head, rates, ceil=ceil, corners=corners)
+        check(found, expected)
+
+
+@pytest.mark.parametrize("corners", [False, True])
+@torch.no_grad()
+def test_the_critic_enlarges_its_verdicts(corners: bool) -> None:
+    maps = normal(1, 2, 64, 96)
+    small = nano("critic")(maps)
+    assert small.shape == (1, 1, 2, 3)
+    found = nano("critic", upsample=True, align_corners=corners)(maps)
+    torch.testing.assert_close(found, bilinear(small, (64, 96), corners=corners))
 
 
 @pytest.mark.parametrize(("name", "changes"), CASES)

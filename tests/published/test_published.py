@@ -186,6 +186,42 @@ def test_group_without_source_has_only_keys_of_experiments() -> None:
     assert listed <= set(EXPERIMENTS)
 
 
+# ---- other scales ---------------------------------------------------------------------------
+
+SMALL = {
+    "optimizer.lr": 1e-3,
+    "optimizer.backbone_multiplier": 1.0,
+    "trainer.max_steps": 240,
+    "trainer.eval_every": 120,
+    "trainer.clip_norm": 1.0,
+    "data.batch_size": 4,
+    "scale.crop_hw": [120, 160],
+    "scale.train_sizes": [120, 132, 144, 156, 168, 180],
+    "scale.num_points": 1024,
+    "scale.warmup_steps": 20,
+    "scale.critic_width": 16,
+    "scale.critic_lr": 1e-3,
+}
+# As the runs of the archive have them; those of scale=demo as its tutorials do.
+OTHER_SCALES: dict[str, dict[str, Any]] = {
+    "bench crm": SMALL | {"schedule.power": 0.9},
+    "bench rtfnet": SMALL | {"optimizer.lr": 5e-3, "trainer.max_steps": 480},
+    "bench sh_adversarial": SMALL
+    | {"optimizer.lr": 0.05, "trainer.max_steps": 160, "scheme.critic_optimizer.lr": 1e-3},
+    "bench heatnet": SMALL | {"trainer.max_steps": 300, "scheme.critic_optimizer.lr": 1e-3},
+    "demo crm": SMALL | {"optimizer.lr": 2e-3},
+}
+
+
+@pytest.mark.parametrize("entry", OTHER_SCALES)
+def test_other_scales_have_the_rates_of_archived_runs(entry: str) -> None:
+    scale, experiment = entry.split()
+    config = compose((f"+experiment={experiment}", f"scale={scale}"))
+    found = dict(flattened(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
+    expected = OTHER_SCALES[entry]
+    assert {key: found[key] for key in expected} == expected
+
+
 # ---- files ----------------------------------------------------------------------------------
 
 

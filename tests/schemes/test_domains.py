@@ -166,8 +166,8 @@ def critic() -> nn.Conv2d:
 
 def scheme_of(model: nn.Module, heads: bool = False, **changes: Any) -> Adversarial:
     settings = {**PAPERS, **changes}
-    labels = "/pseudo" if settings["supervise_target"] else "none"
     confidence = settings["weighed_by_confidence"]
+    labels = "/pseudo" if settings["supervise_target"] or confidence else "none"
     sgd = SGD(lr=LR, backbone_multiplier=1.0, momentum=MOMENTUM, weight_decay=0.0)
     given: dict[str, Any] = {
         "loss": linear.cross_entropy,
@@ -337,7 +337,10 @@ def test_alternating_steps_change_the_critic_and_then_the_network(
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"verdict_loss": "cross_entropy", "target_value": -1.0}, "target_value=-1"),
+        (
+            {"verdict_loss": "cross_entropy", "target_value": -1.0},
+            "source_value=0, target_value=-1",
+        ),
         ({"target_value": 0.0}, "target_value=0"),
         ({"idle_steps": "released"}, "idle_steps=released"),
     ],
@@ -345,6 +348,26 @@ def test_alternating_steps_change_the_critic_and_then_the_network(
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         scheme_of(network(False), **changes)
+
+
+SWITCHES = ("both_ways", "weighed_by_confidence", "halved", "supervise_target", "alternates")
+
+
+@pytest.mark.parametrize("alone", SWITCHES)
+def test_each_switch_alone_requires_its_own(alone: str) -> None:
+    switches = {name: name == alone for name in SWITCHES}
+    required = {
+        need.key: need.value
+        for need in scheme_of(network(False), **switches).record.requires
+        if need.key in ("target_labels", "target_confidence")
+    }
+    confidence = {"target_confidence": True} if alone == "weighed_by_confidence" else {}
+    assert required == {"target_labels": alone == "supervise_target", **confidence}
+    if alone == "alternates":
+        scheme_of(network(False), **switches, idle_steps="released")
+    else:
+        with pytest.raises(InputError, match=r"idle_steps=released requires"):
+            scheme_of(network(False), **switches, idle_steps="released")
 
 
 SOURCE = ("source network", "source loss")

@@ -101,6 +101,7 @@ ALL = ("rgbt", "rgb", "thermal")
         # Only the criterion reads masks; SDN reads the class logits of R' and T' alone.
         (True, (), (2, ALL, 6, 4), {"class": 1 + 2 + 3 + 4, "sdc": 3, "sdn": 4 + 5}),
         (True, ("nonlocal",), (2, ALL, 4, 4), {"class": 1 + 2 + 3 + 4, "sdc": 3}),
+        (True, ("modality",), (2, ALL, 6, 4), {"class": 1 + 4, "sdc": 3, "sdn": 4 + 5}),
         (True, ("modality", "nonlocal"), (2, ALL[:1], 2, 2), {"class": 1 + 2, "sdc": 1}),
         (False, ("complementary", "nonlocal"), (1, ALL, 3, 3), {"class": 1 + 2 + 3}),
     ],

@@ -334,8 +334,11 @@ def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     third_row = torch.tensor([0.0, 0.0, 1.0, 0.0])[:, None].expand(2, 4, 4)
     expected = cost(logits(model, data.target.rgb), label, share.float() * third_row)
     torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
-    with pytest.raises(InputError, match="must be below 1"):
-        scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
+    for top, bottom in ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25)):
+        with pytest.raises(InputError, match="must be below 1"):
+            scheme_of(network(False), ignored_top=top, ignored_bottom=bottom)
+    scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.25)
+    scheme_of(network(False), ignored_top=0.25, ignored_bottom=0.5)
 
 
 def test_labels_come_from_the_average_of_earlier_steps() -> None:

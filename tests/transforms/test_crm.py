@@ -72,7 +72,8 @@ def test_draws_have_their_ranges_and_odds() -> None:
     pair = np.array([[0, 100]], np.uint8)
     same = crm(colour_probability=0.0).coloured(grey, pair, rng)
     assert (same[0].tolist(), same[1].tolist()) == (grey.tolist(), pair.tolist())
-    still: dict[str, Any] = {"colour_probability": 1.0, "brightness_delta": 0.0}
+    still: dict[str, Any] = {"colour_probability": 1.0, "flip_probability": 0.0}
+    still |= {"brightness_delta": 0.0}
     still |= {"contrast_range": (1, 1), "saturation_range": (1, 1), "hue_delta": 0}
     for changes, expected in (
         ({"brightness_delta": 32.0}, (68, 131)),
@@ -89,6 +90,26 @@ def test_draws_have_their_ranges_and_odds() -> None:
     hue, red = crm(**{**still, "hue_delta": 2}), flat(240, 0, 0)
     found = {tuple(hue.coloured(red, pair, rng)[0][0, 0].tolist()) for _ in range(200)}
     assert found == {tuple(shift_hue(red, by)[0, 0].tolist()) for by in (-2, -1, 0, 1, 2)}
+
+
+def test_every_range_is_its_own_and_is_filled() -> None:
+    """S = 1 - 50 / 100 is scaled by its own range, the levels 100 of RGB and thermal by theirs."""
+    ranges = {
+        "contrast_range": (1.2, 1.6),
+        "saturation_range": (0.4, 0.8),
+        "thermal_contrast_range": (2.0, 2.4),
+    }
+    transform = crm(**ranges, colour_probability=1.0, brightness_delta=0.0, hue_delta=0)
+    rng, thermal = np.random.default_rng(3), np.full((2, 2), 100, np.uint8)
+    pairs = [transform.coloured(flat(100, 50, 50), thermal, rng) for _ in range(300)]
+    brightest, darkest = np.array([(rgb.max(), rgb.min()) for rgb, _ in pairs], float).T
+    found = {
+        "contrast_range": brightest / 100,
+        "saturation_range": (1 - darkest / brightest) / 0.5,
+        "thermal_contrast_range": np.array([grey.max() for _, grey in pairs]) / 100,
+    }
+    for name, factors in found.items():  # to a step of a grey level or of OpenCV's saturation
+        assert (factors.min(), factors.max()) == pytest.approx(ranges[name], abs=0.035), name
 
 
 def test_pixels_do_not_depend_on_place_in_row() -> None:

@@ -73,7 +73,11 @@ def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("changes", "key"), [({"crop_hw": (48, 77)}, "crop_hw"), ({"drop_height": (5, 41)}, "drop_")]
+    ("changes", "key"),
+    [
+        *(({"crop_hw": hw}, "crop_hw") for hw in ((48, 77), (49, 60))),
+        *(({name: (5, 61)}, "drop_") for name in ("drop_height", "drop_width")),
+    ],
 )
 def test_heatnet_sizes_that_do_not_fit_are_refused(changes: dict[str, Any], key: str) -> None:
     with pytest.raises(InputError, match=f"transform.{key}"):

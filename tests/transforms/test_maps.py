@@ -66,7 +66,9 @@ def test_bilinear_is_that_of_torch(short_edge: int) -> None:
 def test_a_window_is_the_whole_cut(hw: tuple[int, int]) -> None:
     """Bit for bit in uint8, whose pixels lie in a block that is resized alone."""
     rng, maps = np.random.default_rng(1), Maps.of(noise(1, hw))
-    for short_edge in [*(hw[0] * np.arange(5, 21) // 10), *rng.integers(hw[0] // 3, hw[0], 4)]:
+    enlarged = 5 * [5 * hw[0]] if hw[0] < 100 else []  # a window may begin within a pixel
+    drawn = rng.integers(hw[0] // 3, hw[0], 4)
+    for short_edge in [*(hw[0] * np.arange(5, 21) // 10), *drawn, *enlarged]:
         size = short_edge_hw(hw, int(short_edge), 1920)
         window = drawn_window(size, (int(rng.integers(1, hw[0])), int(rng.integers(1, hw[1]))), rng)
         whole = cv2.resize(maps.rgb, size[::-1], interpolation=cv2.INTER_LINEAR_EXACT)

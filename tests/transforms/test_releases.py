@@ -232,14 +232,27 @@ STEPS = {
     "heatnet": heatnet,
 }
 ROTATING = ("semseg", "heatnet")
+# No two are equal, so that none is read for another one.
+UNEQUAL = {"flip": 0.45, "colour": 0.4, "blur": 0.6, "rotate": 0.55, "drop": 0.5, "thermal": 0.65}
+
+
+def unequal(*names: str) -> tuple[str, ...]:
+    return tuple(f"transform.{name}_probability={UNEQUAL[name]}" for name in names)
+
+
 WORDS = {
+    "crm": unequal("flip", "colour"),
+    # The mean of thermal and two of the three colours are rounded up.
+    "cmx_released": ("transform.padding_thermal=[100.0,102.0,103.0]",),
+    "cmnext_released": unequal("flip", "colour", "blur"),
     # Truncation after a float32 resize shows its last bit: no colours there, see test_crm.
     "crm_released": ("transform.colour_probability=0",),
-    "semseg": ("model=semseg",),
+    "thesis_blur": unequal("flip", "blur"),
+    "semseg": ("model=semseg", *unequal("flip", "blur", "rotate")),
     "heatnet": (
         *("transform.resize_hw=[48,80]", "transform.crop_hw=[40,60]"),
         *("transform.drop_height=[5,20]", "transform.drop_width=[5,30]"),
-        "transform.class_probability=0.5",
+        *("transform.class_probability=0.35", *unequal("flip", "rotate", "drop", "thermal")),
     ),
 }
 

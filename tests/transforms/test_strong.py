@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import colorsys
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from rgbt.randomness import torch_generator
+from rgbt.transforms import strong
 from rgbt.transforms.strong import StrongAugmentation, blurred, jittered
 
 
@@ -41,6 +43,19 @@ def test_changes_of_one_pixel() -> None:
         found = jittered(one, change, by(-0.2 if factor else 0.2))
         # Hue in steps of two degrees, the rest in 255 steps.
         torch.testing.assert_close(found, expected, atol=0.03, rtol=0)
+
+
+def test_levels_saturation_and_hue_are_rounded() -> None:
+    """Level 100.7 is 101; S = 0.9 * 204 = 183.6 is 184, thus 220 (1 - S / 255) = 61.25; a hue of
+    5.67 steps is 6, thus 12 degrees.
+    """
+    for before, change, value, after in (
+        ((100.7, 100.7, 100.7), "saturation", 0.0, (101.0, 101.0, 101.0)),
+        ((220.0, 44.0, 44.0), "saturation", -0.1, (220.0, 61.0, 61.0)),
+        ((255.0, 0.0, 0.0), "hue", 5.67 / 180, (255.0, 255 * 12 / 60, 0.0)),
+    ):
+        found = jittered(pixel(*before) / 255, change, by(value))
+        torch.testing.assert_close(255 * found, pixel(*after), atol=0.01, rtol=0)
 
 
 def test_blur_is_the_gaussian_of_each_image() -> None:
@@ -87,6 +102,38 @@ def test_thermal_has_its_own_draws_and_one_channel() -> None:
         slopes.append(round(slope.item(), 3))
     assert len(set(slopes)) == 3
     assert all(0.8 <= slope <= 1.2 for slope in slopes)
+
+
+def test_draws_fill_their_ranges_and_are_independent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 2000 draws in a range, the ends lie within a hundredth of it."""
+    drawn: dict[tuple[int, str], np.ndarray] = {}
+
+    def jitter(images: Tensor, change: str, by: Tensor) -> Tensor:
+        drawn[images.shape[1], change] = by.flatten().numpy()
+        return images
+
+    def blur(images: Tensor, sigma: Tensor, largest: float) -> Tensor:
+        drawn[images.shape[1], "sigma"] = sigma.numpy()
+        assert largest == 1.15
+        return images
+
+    monkeypatch.setattr(strong, "jittered", jitter)
+    monkeypatch.setattr(strong, "blurred", blur)
+    shown = torch.zeros(2000, 3, 1, 1), torch.zeros(2000, 1, 1, 1)
+    augmentation(1.0, 1.0)(*shown, torch_generator(0, "a"))
+    # Both images have the same sigma; everything else is drawn alone.
+    np.testing.assert_array_equal(drawn.pop((1, "sigma")), drawn[3, "sigma"])
+    changes = [(3, name) for name in ("brightness", "contrast", "saturation", "hue")]
+    changes += [(1, "brightness"), (1, "contrast"), (3, "sigma")]
+    assert set(drawn) == set(changes)
+    for change, values in drawn.items():
+        low, high = (0.15, 1.15) if change[1] == "sigma" else (-0.2, 0.2)
+        hundredth = 0.01 * (high - low)
+        assert low <= values.min() < low + hundredth, change
+        assert high - hundredth < values.max() <= high, change
+        # The standard error of the mean is 0.0065 of the range.
+        assert values.mean() == pytest.approx((low + high) / 2, abs=0.03 * (high - low)), change
+    assert abs(np.corrcoef([*drawn.values()]) - np.eye(7)).max() < 0.1
 
 
 def test_draws_are_replayed_and_their_number_is_fixed() -> None:

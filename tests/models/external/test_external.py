@@ -269,6 +269,16 @@ def test_forward_scores_every_pixel_also_of_odd_sides(tmp_path: Path) -> None:
         external(folder, multiple=4).eval()(*images(2, 9, 13))
 
 
+def test_scores_are_enlarged_between_the_centres_of_their_pixels(tmp_path: Path) -> None:
+    """Two pixels, four times as fine: the values 0 and 1 are 0, 1/4, 3/4, 1."""
+    ramp = "torch.tensor([[0.0, 1], [2, 3]]).expand(len(x), 3, 2, 2)"
+    scores = STACKED.replace("self.conv(x)", f"0 * self.conv(x).mean() + {ramp}")
+    net = external(write_checkout(tmp_path, {"model/net.py": scores}), resize=True).eval()
+    axis = torch.tensor([0, 0.25, 0.75, 1])
+    expected = (2 * axis[:, None] + axis).expand(2, 3, 4, 4)
+    torch.testing.assert_close(net(*images(2, 4, 4)).logits, expected)
+
+
 def test_edges_are_padded_and_resized_as_the_images(tmp_path: Path) -> None:
     sizes = EDGES.replace("return", "assert rgb.shape[2:] == (16, 24)\n        return")
     folder = write_checkout(tmp_path, {"model/net.py": sizes})
