@@ -200,7 +200,9 @@ def _compare(path: Path, stored: RunResult) -> Compared:
     check_result(stored)
     spec = request_again(stored.settings, stored.description.overrides)
     before, now, none = flatten(stored.settings), flatten(spec.plain), object()
-    keys = sorted(filter(is_in_key, before.keys() | now.keys()))
+    # Settings of the trainer that have no name today, such as how often it saved, were in no key.
+    gone = {key for key in before.keys() - now.keys() if key.startswith("trainer.")}
+    keys = sorted(filter(is_in_key, (before.keys() | now.keys()) - gone))
     differing = [key for key in keys if before.get(key, none) != now.get(key, none)]
     if not differing and (spec.names_files or spec.key == stored.key):
         return path, "same", "", spec

@@ -15,7 +15,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from analysis import packing
-from analysis.archive import add, archived, entry, key_of, unpack
+from analysis.archive import _compared, add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.files.plain_files import write_json
 from rgbt.metrics import measurement
@@ -254,6 +254,16 @@ def test_check_reports_changed_keys(
     assert {of.run for of in unpacked.values()} == {only.stem}
     assert len(unpacked) == 7
     assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
+
+
+def test_settings_of_the_trainer_without_a_name_today_change_nothing(
+    run: RunResult, tmp_path: Path
+) -> None:
+    plain = dict(specified(WORDS).plain)
+    plain["trainer"] = {**plain["trainer"], "saved_every": 3}
+    (run.folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(plain)))
+    add(run, tmp_path)
+    assert [(state, why) for _, state, why, _ in _compared(tmp_path)] == [("same", "")]
 
 
 def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from analysis.archive import _compared
 from sweeps.show.claims import statement
 from sweeps.show.pages import MARKED, Report
 from tests.declarations import confirming, has_history, undeclared
@@ -54,6 +55,11 @@ def test_confirming_runs_were_declared_before_they_were_made(report: Report) -> 
     for path, table, claim, run in confirming(section.judged for section in report.tables):
         found.add(undeclared(ROOT, path, table, claim, run))
     assert found - {""} == set()
+
+
+def test_archived_runs_are_undamaged_and_have_the_key_of_their_command() -> None:
+    found = [(path.stem, state, why) for path, state, why, _ in _compared(ROOT / "results")]
+    assert [one for one in found if one[1] != "same"] == [], "rgbt archive check"
 
 
 def test_no_verdict_is_worded_as_of_a_paper_that_is_not_of_its_runs(report: Report) -> None:
