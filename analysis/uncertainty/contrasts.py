@@ -124,6 +124,7 @@ class Resampler:
         self._compared: set[tuple[str, str]] = set()
         self._sums: dict[tuple[object, ...], Values] = {}
         self._resampled: dict[tuple[str, str, Absent, bytes], Values] = {}
+        self._values: dict[tuple[str, str, Absent], float] = {}
         self._influences: dict[tuple[str, Absent], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
@@ -163,7 +164,9 @@ class Resampler:
             used = min(used, len(np.unique(blocks.index[np.isin(first.names, held)])))
         parts, drawn = [], np.zeros(self._settings.resamples if used >= FEWEST else 0)
         for term, of_term in zip(terms, runs, strict=True):
-            points = [value(term.metric, counts, absent) for counts in of_term.values()]
+            points = [
+                self._value(term.metric, key, counts, absent) for key, counts in of_term.items()
+            ]
             parts.append(term.weight * np.array(points))
             if len(drawn):
                 scores = self._drawn(term.metric, of_term, blocks, absent)
@@ -222,6 +225,12 @@ class Resampler:
                 series.append(values(metric, by_image.sum(0) - by_image, counts, absent))
             self._influences[key, absent] = np.stack(series)
         return self._influences[key, absent]
+
+    def _value(self, metric: str, key: str, counts: Counts, absent: Absent) -> float:
+        """Return the score of all images."""
+        if (key, metric, absent) not in self._values:
+            self._values[key, metric, absent] = value(metric, counts, absent)
+        return self._values[key, metric, absent]
 
     def _drawn(
         self, metric: str, runs: Mapping[str, Counts], blocks: ImageBlocks, absent: Absent
