@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from rgbt.checks import InputError
@@ -110,11 +111,8 @@ class Planner:
             return self._composed(overrides, checked=True)
         same, seed = _without_seed(overrides)
         if same not in self._requested:
-            found = row_cache.stored(same)
-            if found is None:
-                found = self._composed(same, checked=False)
-                row_cache.store(same, found)
-            self._requested[same] = found
+            compose = partial(self._composed, same, checked=False)
+            self._requested[same] = row_cache.requested(same, compose)
         run = self._requested[same]
         return run if seed is None else run.with_seed(seed)
 

@@ -1,9 +1,9 @@
-"""Remember which runs the rows of tables request: composing them takes longer than judging them.
+"""Remember what the rows of tables request: composing them takes longer than judging them.
 
-A specification lies in the cache of the user as plain JSON, under a digest of all that decides it:
-its words, every file of ``conf/``, the code of rgbt, the versions of Hydra and OmegaConf. So a
-changed file never gives an old answer. It only says which finished runs belong to a row, by their
-keys: what is trained or built is composed.
+Specifications of runs and sizes of networks lie in the cache of the user as plain JSON, under a
+digest of all that decides them: their words, every file of ``conf/``, the code of rgbt, the
+versions of the packages that compose and build. So a changed file never gives an old answer. They
+only say which finished runs belong to a row, by their keys: what is trained or built is composed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -26,55 +27,68 @@ from rgbt.files.plain_files import read_json, sealed
 from rgbt.runs.run_spec import Dependency, RunSpec
 
 FOLDER = "rows"  # in the cache of rgbt
-PACKAGES = ("hydra-core", "omegaconf")
+PACKAGES = ("hydra-core", "omegaconf", "torch")
+SIZE = "million parameters"
+OUTSIDE = ("hydra", "checkout", "_target_")  # words that name files or code of the user
 
 # Nanoseconds on the clock of the file system when this process had read none of the files: a second
 # less than now, because that clock moves in steps.
 STARTED = time.time_ns() - 10**9
 
 
-def stored(words: tuple[str, ...]) -> RunSpec | None:
-    """Return the specification that the same words and files made before; None: not stored.
+def requested(words: tuple[str, ...], compose: Callable[[], RunSpec]) -> RunSpec:
+    """Return the specification that `compose` makes of words, or made of them before."""
+    plain = _read("run", words)
+    if plain is not None:
+        return _spec_of(plain)
+    spec = compose()
+    _write("run", words, _plain_of(spec))
+    return spec
 
-    Folders of a user's own files, and words about Hydra, are not stored.
-    """
-    path = _place(words)
+
+def size(words: tuple[str, ...], count: Callable[[], float]) -> float:
+    """Return the millions of parameters that `count` finds for words, or found before."""
+    plain = _read("size", words)
+    if plain is not None:
+        return float(plain[SIZE])
+    found = count()
+    _write("size", words, {SIZE: found})
+    return found
+
+
+def _read(kind: str, words: tuple[str, ...]) -> dict[str, Any] | None:
+    """Return what is stored; None: nothing, or a damaged file, which is written again."""
+    path = _place(kind, words)
     if path is None or not path.is_file():
         return None
     try:
-        return _spec_of(read_json(path, dict[str, Any], "it is made again"))
-    except (InputError, KeyError, TypeError, ValueError):
-        return None  # damaged; it is composed, and written again
+        found: dict[str, Any] = read_json(path, dict[str, Any], "it is made again")
+    except InputError:
+        return None
+    return found
 
 
-def store(words: tuple[str, ...], spec: RunSpec) -> None:
-    """Keep what `words` make, unless JSON would change it or a file may have changed meanwhile."""
-    path, plain = _place(words), sealed(_plain_of(spec))
-    if path is None or repr(_plain_of(_spec_of(plain))) != repr(_plain_of(spec)):
+def _write(kind: str, words: tuple[str, ...], plain: dict[str, Any]) -> None:
+    """Store `plain`, unless JSON would change it or a file may have changed meanwhile."""
+    path, content = _place(kind, words), sealed(plain)
+    kept = {key: value for key, value in content.items() if key in plain}
+    if path is None or repr(kept) != repr(plain) or not _is_settled():
         return
-    if not _is_settled():
-        return
-    try:
+    with suppress(OSError):  # a cache that cannot be written: every process composes
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps(plain).encode())
-    except OSError:
-        return  # no cache of the user can be written: every process composes
+        write_atomic(path, json.dumps(content).encode())
 
 
-def _place(words: tuple[str, ...]) -> Path | None:
-    """Return the file of the words; None: they have none."""
-    if own_folders() or any("hydra" in word for word in words):
+def _place(kind: str, words: tuple[str, ...]) -> Path | None:
+    """Return the file of the words; None: what they make depends on further files of the user."""
+    if own_folders() or any(mark in word for word in words for mark in OUTSIDE):
         return None
     files = _digest_of_files(str(conf_dir()))
     if not files:
         return None
     name = hashlib.sha256(json.dumps(words).encode()).hexdigest()[:16]
-    return _folder() / files / f"{name}.json"
-
-
-def _folder() -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home, "rgbt", FOLDER)
+    return Path(home, "rgbt", FOLDER, files, f"{kind}-{name}.json")
 
 
 @cache

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.config.overrides import composing
+from sweeps.plan import row_cache
 from sweeps.plan.request import TableRequest
 from sweeps.score.cells import NO_VALUE, CellId, TableCell
 
@@ -31,7 +32,8 @@ def network_sizes(request: TableRequest) -> dict[CellId, TableCell]:
         words = at_paper.overrides(row.label, 0)[:-1]
         kept = tuple(word for word in words if not word.lstrip("+~").startswith(NOT_NETWORK))
         try:
-            cell = TableCell(million_parameters(kept), math.nan, 0)
+            number = row_cache.size(kept, partial(million_parameters, kept))
+            cell = TableCell(number, math.nan, 0)
         except InputError as error:
             cell = TableCell(math.nan, math.nan, 0, str(error), NO_VALUE)
         for column in request.table.columns_of(row):
