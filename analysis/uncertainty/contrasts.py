@@ -30,8 +30,8 @@ from rgbt.metrics.score_grid import headlines
 # Seed of counts that belong to no seed: a folder of predictions, one file of weights.
 FIXED = -1
 
-# Most numbers in all drawn sums that are kept, because many scores read the same: 128 MiB.
-KEPT = 2**24
+# Most numbers in the drawn sums that a resampler keeps, because many scores read the same: 32 MiB.
+KEPT = 2**22
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +193,8 @@ class Resampler:
             key = term.keys[seed]
             if (name, key) not in self._compared:
                 same = in_order(reference.counts[firsts[0]], term.counts[seed], self._alike)
-                self._ordered.setdefault(key, same.select(sorted(same.names)))
+                names = tuple(sorted(same.names))
+                self._ordered[key] = same if same.names == names else same.select(names)
                 self._compared.add((name, key))
             found[key] = self._ordered[key]
         return found
