@@ -32,8 +32,7 @@ def network_sizes(request: TableRequest) -> dict[CellId, TableCell]:
         words = at_paper.overrides(row.label, 0)[:-1]
         kept = tuple(word for word in words if not word.lstrip("+~").startswith(NOT_NETWORK))
         try:
-            number = row_cache.size(kept, partial(million_parameters, kept))
-            cell = TableCell(number, math.nan, 0)
+            cell = TableCell(million_parameters(kept), math.nan, 0)
         except InputError as error:
             cell = TableCell(math.nan, math.nan, 0, str(error), NO_VALUE)
         for column in request.table.columns_of(row):
@@ -46,8 +45,13 @@ def network_sizes(request: TableRequest) -> dict[CellId, TableCell]:
 def million_parameters(overrides: tuple[str, ...]) -> float:
     """Count the millions of parameters of the network that overrides of a run describe.
 
-    It is built on torch's device "meta". Discriminators are not counted. InputError: as refused.
+    It is built on torch's device "meta", once for the same files (`sweeps.plan.row_cache`).
+    Discriminators are not counted. InputError: as refused.
     """
+    return row_cache.size(overrides, partial(_counted, overrides))
+
+
+def _counted(overrides: tuple[str, ...]) -> float:
     import torch
 
     with composing(overrides), torch.device("meta"):
