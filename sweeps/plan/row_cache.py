@@ -29,7 +29,7 @@ from rgbt.runs.run_spec import Dependency, RunSpec
 FOLDER = "rows"  # in the cache of rgbt
 PACKAGES = ("hydra-core", "omegaconf", "torch")
 SIZE = "million parameters"
-OUTSIDE = ("hydra", "checkout", "_target_")  # words that name files or code of the user
+OUTSIDE = ("hydra", "checkout", "external", "_target_")  # words of files or code of others
 
 # Nanoseconds on the clock of the file system when this process had read none of the files: a second
 # less than now, because that clock moves in steps.
