@@ -26,7 +26,7 @@ from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import score_grid
-from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
+from rgbt.metrics.scores import MEANS, iou, miou, recall, tally, variance
 from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
 from rgbt.runs.result import COUNTS, RunResult
 from rgbt.terminal import info, warn
@@ -196,15 +196,15 @@ def _part_rows(
     subset: str, counts: Counts, absent: Absent, scored: NDArray[np.bool_]
 ) -> Iterator[ScoreRow]:
     """Yield the scores of single frames of one subset; region 0 is the whole image."""
-    by_region = counts.by_region()
-    matrices = np.concatenate([by_region.sum(0, keepdims=True), by_region])
+    by_region = tally(counts.by_region())
+    places = np.concatenate([by_region.sum(0, keepdims=True), by_region])
     for metric, mean in MEANS.items():
-        for region, score in enumerate(100 * mean(matrices, absent, scored)):
+        for region, score in enumerate(100 * mean(places, absent, scored)):
             yield subset, region, "", metric, float(score)
     of_regions = miou(by_region, absent, scored)
     yield subset, 0, "", names.VAR, float(variance(of_regions))
     for metric, by_class in (("IoU", iou), ("acc", recall)):
-        for region, scores in enumerate(100 * by_class(matrices, absent)):
+        for region, scores in enumerate(100 * by_class(places, absent)):
             for name, score in zip(counts.classes, scores.tolist(), strict=True):
                 yield subset, region, name, metric, score
 

@@ -18,7 +18,7 @@ from rgbt import consistency, predict
 from rgbt.files.plain_files import read_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.metrics.pairs import ca, ca_released, tc
+from rgbt.metrics.pairs import ca, ca_released, frames, tc, triples
 from rgbt.randomness import numpy_generator
 from rgbt.runs.result import RunResult
 from rgbt.transforms.views import read_angles
@@ -90,10 +90,10 @@ def test_run_measures_its_consistency(trained: Trained) -> None:
 
     absent = OmegaConf.load(folder / "config.yaml").metric.absent
     expected = {
-        "TC/aligned": tc(aligned.by_region(), absent),
-        "CA/aligned": ca(aligned.by_region(), absent),
-        "TC/released": tc(released.by_region(), absent),
-        "CA/released": ca_released(released.by_region(), absent),
+        "TC/aligned": tc(frames(aligned.by_region()), absent),
+        "CA/aligned": ca(triples(aligned.by_region()), absent),
+        "TC/released": tc(frames(released.by_region()), absent),
+        "CA/released": ca_released(triples(released.by_region()), absent),
     }
     result, table = read(folder, "result.json"), read(folder, "tables.json")["consistency"]
     assert not [name for name in result["val"] if name.startswith(("TC", "CA"))]

@@ -43,7 +43,7 @@ from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.pair_list import ListedPair, read_list
-from rgbt.metrics.scores import miou
+from rgbt.metrics.scores import miou, tally
 from rgbt.tracking.pictures import colours
 from rgbt.types import IGNORE, Sample
 
@@ -184,7 +184,7 @@ def panel(
         for method, folder in folders.items():
             painted.append(read_prediction(folder, reader, name, label.shape))
             counts = region_counts(label, painted[-1], len(scored), WHOLE).sum(0)
-            score = float(100 * miou(counts, "exclude", scored))
+            score = float(100 * miou(tally(counts), "exclude", scored))
             numbers.append((name, method.replace("\n", " "), score))
         thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
         pictures.append([sample.rgb, thermal, *(colours(classes, palette) for classes in painted)])

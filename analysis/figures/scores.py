@@ -28,7 +28,7 @@ from rgbt.metrics.measurement import CLEAN
 from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
-from rgbt.metrics.scores import class_mean, miou
+from rgbt.metrics.scores import class_mean, miou, tally
 from rgbt.tables import class_labels
 from rgbt.tracking.pictures import colour_limits
 
@@ -151,7 +151,7 @@ def corrupted(
     convened = absent or convention(all_counts)
     cells = []
     for method, number, level in every:
-        score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
+        score = 100 * miou(tally(level.counts.whole()), convened, level.counts.scored)
         of = level.counts.measurement
         row = row_of(level)
         about = row, of.title or (CLEAN if row == CLEAN else of.label), of.unit, of.severity

@@ -37,7 +37,7 @@ from rgbt.config.options import Help
 from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.names import NIGHT
-from rgbt.metrics.scores import class_mean, miou, recall
+from rgbt.metrics.scores import class_mean, miou, recall, tally
 
 TRENDS = {
     "vertical": "(a) vertical (left to right)",
@@ -214,7 +214,7 @@ def trend(
     series = {("SOR", "SOR"): occupancy}
     for label, counts in methods.items():
         check_partition(label, counts, f"{partition}{len(occupancy)}")
-        summed = counts.by_region()
+        summed = tally(counts.by_region())
         series["IoU", f"IoU ({label})"] = miou(summed, absent, counts.scored)
         series["Acc", f"Acc ({label})"] = class_mean(recall(summed, absent), counts.scored)
     rows = []
@@ -314,7 +314,7 @@ def class_regions(
             counts = counts.select(name for name, dark in at_night if dark == (part == NIGHT))
             if not counts.names:
                 raise InputError(f"part={part}: the counts of '{label}' contain no such image.")
-        scores = miou(counts.by_region(), absent or counts.absent, counts.scored)
+        scores = miou(tally(counts.by_region()), absent or counts.absent, counts.scored)
         series[f"mIoU ({label})"] = 100 * scores
     rows = []
     for name, values in series.items():

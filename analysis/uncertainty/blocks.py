@@ -144,7 +144,7 @@ def make_blocks(
     singles, said = [*np.arange(len(names))[:, None]], f"{len(names)} single images"
     if choice in ("none", 1):
         return _joined(singles, parts, said)
-    sequences = _sequences(names, parts)
+    sequences = _sequences(tuple(names), tuple(parts.tolist()))
     if not sequences:
         such = f"names such as '{names[0]}' show no neighbouring frames (that differ in one number)"
         if choice != "auto":
@@ -250,11 +250,13 @@ def _range(pieces: Sequence[Places]) -> str:
     return str(most) if least == most else f"{least} to {most}"
 
 
-def _sequences(names: Sequence[str], parts: Places) -> list[tuple[Values, Places]]:
+@lru_cache(maxsize=32)
+def _sequences(names: tuple[str, ...], parts: tuple[int, ...]) -> list[tuple[Values, Places]]:
     """Find the frames of every sequence, numbers and places in their order; [] if there is none.
 
     The frame is the last number in the names that is not the same in all of them; names that are
-    equal but for it, and lie in one stratum, are one sequence.
+    equal but for it, and lie in one stratum, are one sequence. Callers share the list, because many
+    contrasts are about the same images.
     """
     words = [re.split(r"(\d+)", name) for name in names]
     shapes: dict[tuple[str, ...], list[int]] = {}

@@ -10,11 +10,10 @@ as in rliable (Agarwal et al., NeurIPS 2021).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.uncertainty.blocks import FEWEST, ImageBlocks, Resampling, Values, make_blocks
 from analysis.uncertainty.intervals import Spread, over_images, over_seeds
@@ -24,12 +23,15 @@ from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.named import ParsedMetric, images_of, parse, value, values
+from rgbt.metrics.named import ParsedMetric, images_of, parse, sums_of, value, values
 from rgbt.metrics.pairs import HEADLINES, protocol_of
 from rgbt.metrics.score_grid import headlines
 
 # Seed of counts that belong to no seed: a folder of predictions, one file of weights.
 FIXED = -1
+
+# Most numbers in the drawn sums that a resampler keeps, because many scores read the same: 32 MiB.
+KEPT = 2**22
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,20 +107,24 @@ def combine(weights: Sequence[float], parts: Sequence[Evidence]) -> Evidence:
 
 
 class Resampler:
-    """Evidence about contrasts; scores of a run are resampled once.
+    """Evidence about contrasts; scores of a run are resampled once, in whatever table they are.
 
     Images are drawn in the order of their names, so that the draws depend on no term. With
     ``blocks=auto`` the length of the blocks is that of each contrast (see
     `analysis.uncertainty.blocks.make_blocks`).
 
-    `alike` is what the counts must have in common beside images and classes.
+    `alike` is what the counts must have in common beside images and classes. Draws of a score are
+    kept (16 kB of 2,000), those of the sums that it reads up to `KEPT`.
     """
 
     def __init__(self, settings: Resampling, alike: Alike = "labels") -> None:
         self._settings = settings
         self._alike = alike
-        self._ordered: dict[tuple[str, str], Counts] = {}
+        self._ordered: dict[str, Counts] = {}
+        self._compared: set[tuple[str, str]] = set()
+        self._sums: dict[tuple[object, ...], Values] = {}
         self._resampled: dict[tuple[str, str, Absent, bytes], Values] = {}
+        self._values: dict[tuple[str, str, Absent], float] = {}
         self._influences: dict[tuple[str, Absent], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
@@ -158,7 +164,9 @@ class Resampler:
             used = min(used, len(np.unique(blocks.index[np.isin(first.names, held)])))
         parts, drawn = [], np.zeros(self._settings.resamples if used >= FEWEST else 0)
         for term, of_term in zip(terms, runs, strict=True):
-            points = [value(term.metric, counts, absent) for counts in of_term.values()]
+            points = [
+                self._value(term.metric, key, counts, absent) for key, counts in of_term.items()
+            ]
             parts.append(term.weight * np.array(points))
             if len(drawn):
                 scores = self._drawn(term.metric, of_term, blocks, absent)
@@ -183,10 +191,12 @@ class Resampler:
         name, found = reference.keys[firsts[0]], {}
         for seed in seeds if seeds and not term.fixed else sorted(term.counts):
             key = term.keys[seed]
-            if (name, key) not in self._ordered:
+            if (name, key) not in self._compared:
                 same = in_order(reference.counts[firsts[0]], term.counts[seed], self._alike)
-                self._ordered[name, key] = same.select(sorted(same.names))
-            found[key] = self._ordered[name, key]
+                names = tuple(sorted(same.names))
+                self._ordered[key] = same if same.names == names else same.select(names)
+                self._compared.add((name, key))
+            found[key] = self._ordered[key]
         return found
 
     def _series(
@@ -210,11 +220,18 @@ class Resampler:
     def _influence(self, key: str, counts: Counts, absent: Absent) -> Values:
         """Return the `watched` scores (L, N) of all images but one."""
         if (key, absent) not in self._influences:
-            by_image = counts.counts.astype(np.float64)
-            without = by_image.sum(0) - by_image
-            series = [values(metric, without, counts, absent) for metric in watched(counts)]
+            series = []
+            for metric in watched(counts):
+                by_image = sums_of(metric, counts.counts, counts.partition)
+                series.append(values(metric, by_image.sum(0) - by_image, counts, absent))
             self._influences[key, absent] = np.stack(series)
         return self._influences[key, absent]
+
+    def _value(self, metric: str, key: str, counts: Counts, absent: Absent) -> float:
+        """Return the score of all images."""
+        if (key, metric, absent) not in self._values:
+            self._values[key, metric, absent] = value(metric, counts, absent)
+        return self._values[key, metric, absent]
 
     def _drawn(
         self, metric: str, runs: Mapping[str, Counts], blocks: ImageBlocks, absent: Absent
@@ -224,16 +241,35 @@ class Resampler:
         for key, counts in runs.items():
             if (key, *place) not in self._resampled:
                 missing[key] = counts
-        columns, scores = {}, {key: list[Values]() for key in missing}
-        for key, counts in missing.items():
-            array, parsed = _columns(parse(metric), counts)
-            columns[key] = blocks.summed(array.reshape(len(array), -1)), array.shape[1:], parsed
-        for weights in blocks.draws(self._settings) if missing else ():
-            for key, (flat, shape, parsed) in columns.items():
-                summed = (weights @ flat).reshape(-1, *shape)
-                scores[key].append(values(parsed, summed, missing[key], absent))
+        parsed, scores = parse(metric), {key: list[Values]() for key in missing}
+        for key, sums in self._drawn_sums(parsed, missing, blocks):
+            scores[key].append(values(parsed, sums, missing[key], absent))
         self._resampled |= {(key, *place): np.concatenate(scores[key]) for key in missing}
         return [self._resampled[key, *place] for key in runs]
+
+    def _drawn_sums(
+        self, metric: ParsedMetric, runs: Mapping[str, Counts], blocks: ImageBlocks
+    ) -> Iterator[tuple[str, Values]]:
+        """Yield keys with drawn sums (..., M, K) that the metric reads, some resamples at once."""
+        place = (metric.sums, blocks.index.tobytes())
+        to_draw = {}
+        for key, counts in runs.items():
+            if (key, *place) in self._sums:
+                yield key, self._sums[key, *place]
+                continue
+            by_image = _by_image(metric, counts)
+            to_draw[key] = blocks.summed(by_image.reshape(len(by_image), -1)), by_image.shape[1:]
+        numbers = sum(flat.shape[1] for flat, _ in to_draw.values()) * self._settings.resamples
+        drawn = {key: list[Values]() for key in to_draw if numbers <= KEPT}
+        for weights in blocks.draws(self._settings) if to_draw else ():
+            for key, (flat, shape) in to_draw.items():
+                sums = (weights @ flat).reshape(-1, *shape)
+                yield key, sums
+                if key in drawn:
+                    drawn[key].append(sums)
+        self._sums |= {(key, *place): np.concatenate(parts) for key, parts in drawn.items()}
+        while sum(sums.size for sums in self._sums.values()) > KEPT:
+            del self._sums[next(iter(self._sums))]  # the oldest
 
 
 def watched(like: Counts) -> tuple[ParsedMetric, ...]:
@@ -248,24 +284,13 @@ def watched(like: Counts) -> tuple[ParsedMetric, ...]:
     return tuple(map(parse, HEADLINES[protocol] if protocol else single))
 
 
-def _columns(metric: ParsedMetric, counts: Counts) -> tuple[NDArray[np.integer], ParsedMetric]:
-    """Return the counts (N, ...) that the metric reads, and the metric of their sum.
-
-    Images of another part of the day are 0. Regions that are not read are summed or left out,
-    because the draws are the slow part.
-    """
-    array: NDArray[np.integer] = counts.counts
-    if metric.part is not None:
-        used = np.isin(counts.names, images_of(metric, counts).names)
-        array = array * used[:, None, None, None]
-    # Rows of counts of pairs of frames and of details are not regions.
-    if protocol_of(counts.partition) is None and metric.details is None:
-        if metric.region is None and metric.score != names.VAR:
-            array = array.sum(1, keepdims=True, dtype=np.int64)
-        elif metric.region is not None and metric.region <= array.shape[1]:
-            array = array[:, metric.region - 1 : metric.region]
-            metric = replace(metric, region=1)
-    return array, metric
+def _by_image(metric: ParsedMetric, counts: Counts) -> Values:
+    """Return what the metric reads (N, ..., M, K); images of another part of the day are 0."""
+    sums = sums_of(metric, counts.counts, counts.partition)
+    if metric.part is None:
+        return sums
+    used = np.isin(counts.names, images_of(metric, counts).names)
+    return sums * used.reshape(-1, *[1] * (sums.ndim - 1))
 
 
 def _common_seeds(terms: Sequence[Term]) -> tuple[int, ...]:

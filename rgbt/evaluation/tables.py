@@ -23,11 +23,13 @@ from rgbt.terminal import result_view, rich_table
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
     """Make the tables of counts of single frames over `regions`; `label` names their row."""
     absent, scored = counts.absent, counts.scored
-    whole, by_region = counts.whole(), counts.by_region()
+    matrices = counts.by_region()
+    by_region = scores.tally(matrices)
+    whole = by_region.sum(0)
     region_ious = scores.miou(by_region, absent, scored)
     subset_mious = {}
     for part, images in counts.parts().items():
-        subset_mious[part] = float(scores.miou(images.whole(), absent, scored))
+        subset_mious[part] = float(scores.miou(scores.tally(images.whole()), absent, scored))
     return ResultTables(
         split=counts.split,
         step=step,
@@ -45,7 +47,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
             subset_mious=subset_mious,
             unscored=counts.unscored,
-            notes=scores.absent_notes(by_region, counts.classes, scored, counts.split, absent),
+            notes=scores.absent_notes(matrices, counts.classes, scored, counts.split, absent),
         ),
     )
 

@@ -4,6 +4,9 @@ A name is ``[day/ or night/][class/<name>/][region/<n>/][score]``, where the sco
 `SCORES`; distance and size are followed by a bin: ``class/car/region/1/size/64-256``. Without a
 score, ``region/<n>`` is the mIoU of region n, and ``class/<name>`` the IoU of a class. Means are
 over the scored classes (`Counts.scored`); every single class is available by name.
+
+A score is computed in two steps: `sums_of` is linear in the counts, so that it may be taken before
+images are added; `values` is the rest.
 """
 
 from __future__ import annotations
@@ -22,13 +25,15 @@ from rgbt.metrics.details import KINDS, DetailKind, details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import MEANS, ByClass, Matrices, Scores
 
-PAIR_SCORES: dict[str, ByClass] = {
-    names.TC: pairs.tc,
-    names.CA: pairs.ca,
-    names.CA_RELEASED: pairs.ca_released,
+Sums = Callable[[Matrices], Scores]  # linear
+
+PAIR_SCORES: dict[str, tuple[Sums, ByClass]] = {
+    names.TC: (pairs.frames, pairs.tc),
+    names.CA: (pairs.triples, pairs.ca),
+    names.CA_RELEASED: (pairs.triples, pairs.ca_released),
 }
-# Pixels that change and all pixels (..., K), by the class of the first frame.
-CHANGES: dict[str, Callable[[Matrices], tuple[Scores, Scores]]] = {
+# Pixels that change and all pixels (..., 2, K), by the class of the first frame.
+CHANGES: dict[str, Sums] = {
     names.WARPING_ERROR: pairs.changed,
     names.FLICKER: pairs.flickered,
 }
@@ -43,8 +48,8 @@ CLASS_SCORES: dict[str, ByClass] = {
     "IoU": scores.iou,
     "acc": scores.recall,
     names.DISTANCE: scores.iou,
-    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.boundary_iou),
-    names.SIZE: lambda counts, _: scores.object_recall(counts),
+    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.iou),
+    names.SIZE: lambda tallies, _: scores.object_recall(tallies),
 }
 SINGLE, PAIRS = "single frames", "pairs of frames"
 EVERYWHERE = ("", "region", "class", "class region")
@@ -87,6 +92,13 @@ class ParsedMetric:
         """Return the kind of details that have the score; None: other counts."""
         return self.needs if self.needs in KINDS else None
 
+    @property
+    def sums(self) -> tuple[str | None, bool, Sums]:
+        """Return what it reads of counts: part, whether by region, and how; see `sums_of`."""
+        pair_score, _ = PAIR_SCORES.get(self.score, (scores.tally, None))
+        by_region = self.region is not None or self.score == names.VAR
+        return self.part, by_region, CHANGES.get(self.score, pair_score)
+
 
 def parse(metric: str) -> ParsedMetric:
     """Take a metric name apart; InputError: it is none, with the nearest one."""
@@ -113,17 +125,44 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
     """
     parsed = parse(metric)
     by_region = images_of(parsed, counts).by_region()
-    return float(values(parsed, by_region, counts, absent))
+    return float(values(parsed, sums_of(parsed, by_region, counts.partition), counts, absent))
 
 
-def values(
-    parsed: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
-) -> NDArray[np.float64]:
-    """Compute a score (...) of many summed counts, e.g. one per resample; see also `value`.
+def sums_of(parsed: ParsedMetric, counts: Matrices, partition: str) -> Scores:
+    """Return all that a score reads of counts, float64; scores with equal `sums` read the same.
+
+    It is linear: the sums of several images add up to those of the images together, exactly.
 
     Args:
-        parsed: the score; its part (day, night) has been taken by `images_of` before summing.
-        by_region: (..., R, K, K), summed over images; of details (..., R G, M, K).
+        parsed: the score; its part (day, night) is that of the images, see `images_of`.
+        counts: (..., R, K, K), of details (..., R G, M, K).
+        partition: of the counts, which have the score (`check_kind`).
+
+    Returns:
+        of single frames and details (..., R, G, 3, K), with R = 1 for the whole image; of pairs
+        (..., S, 3, K), or (..., 2, K) of `CHANGES`.
+    """
+    _, by_region, sums = parsed.sums
+    if protocol := pairs.protocol_of(partition):
+        if protocol == "flow" and sums is pairs.triples:  # labels may be missing
+            return pairs.triples(counts, only_labelled=True)
+        return sums(counts)
+    details = details_of(partition)
+    *leading, _, measures, classes = counts.shape
+    groups = 1 if details is None else details.groups
+    grouped = counts.reshape(*leading, -1, groups, measures, classes)
+    if not by_region:
+        grouped = grouped.sum(-4, keepdims=True)
+    is_tally = details is not None and details.kind in ("boundary", "calibration")
+    return grouped.astype(np.float64) if is_tally else scores.tally(grouped)
+
+
+def values(parsed: ParsedMetric, sums: Scores, like: Counts, absent: Absent) -> NDArray[np.float64]:
+    """Compute a score (...) of many sums, e.g. one per resample; see also `value`.
+
+    Args:
+        parsed: the score.
+        sums: what it reads of summed counts, see `sums_of`.
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: see `value`.
     """
@@ -138,19 +177,17 @@ def values(
         return np.asarray(mean)
 
     if parsed.score in CHANGES:
-        part, every = CHANGES[parsed.score](by_region)
+        part, every = scores.rows(sums)
         if index is None:
             part, every = part.sum(-1), every.sum(-1)
         else:
             part, every = part[..., index], every[..., index]
         return 100.0 * np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
     if parsed.score in PAIR_SCORES:
-        return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))
+        return mean_or_class(100.0 * _pair_scores(parsed.score, sums, like.partition, absent))
     if parsed.score == names.VAR:
-        return scores.variance(scores.miou(by_region, absent, like.scored))
-    groups = 1 if details is None else details.groups
-    *leading, _, measures, classes = by_region.shape
-    chosen = _of_region(parsed, by_region.reshape(*leading, -1, groups, measures, classes))
+        return scores.variance(scores.miou(sums[..., 0, :, :], absent, like.scored))
+    chosen = _of_region(parsed, sums)
     if parsed.score == names.ECE:
         return 100.0 * scores.ece(chosen if index is None else chosen[..., index : index + 1])
     group = chosen[..., details.bins.index(parsed.bin) if details and parsed.bin else 0, :, :]
@@ -159,13 +196,21 @@ def values(
     return 100.0 * mean_or_class(CLASS_SCORES[parsed.score](group, absent))
 
 
-def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
-    """Compute one of `PAIR_SCORES` by class (..., K); along estimated flow CA is of labels."""
+def pair_scores(score: str, counts: Counts, absent: Absent) -> Scores:
+    """Compute one of `PAIR_SCORES` by class (K,); along estimated flow, CA of labelled pixels."""
+    sums = sums_of(ParsedMetric(score, None, score), counts.by_region(), counts.partition)
+    return _pair_scores(score, sums, counts.partition, absent)
+
+
+def _pair_scores(score: str, sums: Scores, partition: str, absent: Absent) -> Scores:
+    """Compute the same (..., K) of sums; NaN of CA where no pixel has a label."""
+    _, by_class = PAIR_SCORES[score]
+    found = by_class(sums, absent)
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
-        known = pairs.only_labelled(by_region)
-        without = np.isnan(known[..., :1, 0, 0])
-        return np.where(without, np.nan, PAIR_SCORES[score](np.nan_to_num(known), absent))
-    return PAIR_SCORES[score](by_region, absent)
+        _, sizes, _ = scores.rows(sums)
+        without = sizes.sum((-2, -1)) == 0
+        return np.where(without[..., None], np.nan, found)
+    return found
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
@@ -202,11 +247,11 @@ def details_of_metric(metric: str) -> DetailKind | None:
     return ParsedMetric(metric, None, found["score"] or "").details if found else None
 
 
-def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:
+def _of_region(parsed: ParsedMetric, sums: Scores) -> Scores:
     """Take the region of a metric, or add all: (..., R, G, M, K) -> (..., G, M, K)."""
-    regions = by_region.shape[-4]
+    regions = sums.shape[-4]
     if parsed.region is None:
-        return np.asarray(by_region.sum(-4))
+        return np.asarray(sums.sum(-4))
     if parsed.region > regions:
         raise InputError(f"'{parsed.metric}': the counts have the regions 1 to {regions}.")
-    return by_region[..., parsed.region - 1, :, :, :]
+    return sums[..., parsed.region - 1, :, :, :]

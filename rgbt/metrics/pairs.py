@@ -14,7 +14,8 @@ partition, e.g. "aligned3", is the protocol and S:
     "triples":  three frames A, B, C along two estimated flows: y is the class of A, p1 that of B
                 and p2 that of C, at the pixels of C that are reliable in both.
 
-Scores take counts (..., S (K + 1), K, K), summed over images, and return (..., K) by class.
+Scores read sums of them: `frames` and `triples` are (..., S, 3, K), `changed` and `flickered`
+(..., 2, K). These add up over images. Scores are (..., K) by class.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
+from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio, rows, tally
 
 Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
@@ -52,7 +53,12 @@ def protocol_of(partition: str) -> Protocol | None:
     return next((known for known in PROTOCOLS if found and found[1] == known), None)
 
 
-def tc(pairs: Matrices, absent: Absent) -> Scores:
+def frames(pairs: Matrices) -> Scores:
+    """Count pixels of a class in both, in the first and in the second frame: (..., S, 3, K)."""
+    return tally(_by_set(pairs).sum(-3))
+
+
+def tc(frames: Scores, absent: Absent) -> Scores:
     """Compute temporal consistency of each class, 0..1: IoU of the two predictions.
 
         |P1 = P2 = c| / |P1 = c or P2 = c|,  of every set alone, then the mean over the S sets
@@ -60,62 +66,62 @@ def tc(pairs: Matrices, absent: Absent) -> Scores:
     Source: Temporal, Fig. 4; release, evaluation code, whose denominator has 1e-10 more. By
     `absent`, a class that neither frame of a set shows is left out of the mean over the sets.
     """
-    return _over_sets(iou(_by_set(pairs).sum(-3), absent))
+    return _over_sets(iou(frames, absent))
 
 
-def ca(pairs: Matrices, absent: Absent) -> Scores:
+def triples(pairs: Matrices, *, only_labelled: bool = False) -> Scores:
+    """Count what all three say, the sum of three sizes, and of overlaps of two: (..., S, 3, K).
+
+    With `only_labelled`, pixels without a label are left out.
+    """
+    by_set = _by_set(pairs)
+    labelled = by_set[..., :-1, :, :]
+    both = (labelled if only_labelled else by_set).sum(-3)
+    three = np.einsum("...ccc->...c", labelled)
+    sizes = both.sum(-1) + both.sum(-2) + labelled.sum((-1, -2))
+    twos = (both, labelled.sum(-1), labelled.sum(-2))
+    overlaps: Scores = np.sum([np.diagonal(x, axis1=-2, axis2=-1) for x in twos], axis=0)
+    return np.stack((three, sizes, overlaps), axis=-2)
+
+
+def ca(triples: Scores, absent: Absent) -> Scores:
     """Compute consistent accuracy, as `tc`. Source: Temporal, Fig. 4 (E over A + ... + G).
 
     |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
     """
-    three, sizes, overlaps = _triples(pairs)
+    three, sizes, overlaps = rows(triples)
     return _over_sets(ratio(three, sizes - overlaps + three, absent))
 
 
-def ca_released(pairs: Matrices, absent: Absent) -> Scores:
+def ca_released(triples: Scores, absent: Absent) -> Scores:
     """Compute `ca` as coded (Temporal release), which counts what two of three share twice.
 
     |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
     """
-    three, sizes, _ = _triples(pairs)
+    three, sizes, _ = rows(triples)
     return _over_sets(ratio(three, sizes - 2 * three, absent))
 
 
-def only_labelled(pairs: Matrices) -> Scores:
-    """Remove pixels without a label from counts; NaN where no pixel has one."""
-    by_set = _by_set(pairs).copy()
-    by_set[..., -1, :, :] = 0
-    known = by_set.any((-4, -3, -2, -1), keepdims=True)
-    return np.where(known, by_set, np.nan).reshape(pairs.shape)
-
-
-def changed(pairs: Matrices) -> tuple[Scores, Scores]:
+def changed(pairs: Matrices) -> Scores:
     """Count pixels by class of the first frame: with another class in the second, and all.
 
-    Source: Lai et al. (ECCV 2018), with classes in place of colours. Summed over the S sets.
+    The result is (..., 2, K), summed over the S sets. Source: Lai et al. (ECCV 2018), with classes
+    in place of colours.
     """
-    frames = _by_set(pairs).sum((-4, -3))
-    every = frames.sum(-1)
-    return every - np.diagonal(frames, axis1=-2, axis2=-1), every
+    both = _by_set(pairs).sum((-4, -3))
+    every = both.sum(-1)
+    return np.stack((every - np.diagonal(both, axis1=-2, axis2=-1), every), axis=-2)
 
 
-def flickered(triples: Matrices) -> tuple[Scores, Scores]:
-    """Count pixels by the class of frame A: those with it in A and C but not in B, and all."""
-    rows = _by_set(triples).sum(-4)[..., :-1, :, :]
-    outer = np.einsum("...aba->...a", rows)
-    return outer - np.einsum("...aaa->...a", rows), rows.sum((-2, -1))
+def flickered(triples: Matrices) -> Scores:
+    """Count pixels by the class of frame A: those with it in A and C but not in B, and all.
 
-
-def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
-    """Count what all three say, the sum of three sizes, and of overlaps of two: (..., S, K)."""
-    by_set = _by_set(pairs)
-    labelled = by_set[..., :-1, :, :]
-    frames = by_set.sum(-3)
-    three = np.einsum("...ccc->...c", labelled)
-    sizes = frames.sum(-1) + frames.sum(-2) + labelled.sum((-1, -2))
-    twos = (frames, labelled.sum(-1), labelled.sum(-2))
-    overlaps: Scores = np.sum([np.diagonal(x, axis1=-2, axis2=-1) for x in twos], axis=0)
-    return three, sizes, overlaps
+    The result is (..., 2, K), summed over the S sets.
+    """
+    by_class = _by_set(triples).sum(-4)[..., :-1, :, :]
+    outer = np.einsum("...aba->...a", by_class)
+    part = outer - np.einsum("...aaa->...a", by_class)
+    return np.stack((part, by_class.sum((-2, -1))), axis=-2)
 
 
 def _by_set(pairs: Matrices) -> Scores:

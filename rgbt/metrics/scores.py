@@ -1,8 +1,10 @@
 """Compute all scores from counts.
 
-Counts are (..., K, K), rows = label, columns = prediction. Scores of classes are (..., K), means
-over the scored ones (`rgbt.metrics.counts.Counts.scored`) are (...): fractions 0..1; variances are
-in squared percent points, as the papers print them.
+Counts are (..., K, K), rows = label, columns = prediction. A score reads their `tally`: three
+numbers of pixels by class (..., 3, K), which add up over images and regions. Those of boundaries
+(`rgbt.metrics.details`) are tallies already. Scores of classes are (..., K), means over the scored
+ones (`rgbt.metrics.counts.Counts.scored`) are (...): fractions 0..1; variances are in squared
+percent points, as the papers print them.
 
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
@@ -30,30 +32,48 @@ from rgbt.metrics.metric import Absent
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
 Scored = NDArray[np.bool_] | None  # (K,): which classes means are over; None: all
-ByClass = Callable[[Matrices, Absent], Scores]  # counts -> fractions (..., K)
+ByClass = Callable[[Scores, Absent], Scores]  # sums of counts -> fractions (..., K)
 
 
-def iou(counts: Matrices, absent: Absent) -> Scores:
-    """Compute intersection over union: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18)."""
-    right, labelled, predicted = _sums(counts)
+def tally(counts: Matrices) -> Scores:
+    """Count right, labelled and predicted pixels by class: (..., K, K) -> (..., 3, K) float64.
+
+    That is TP, TP + FN and TP + FP. Sums of whole numbers are exact in float64.
+    """
+    right = np.diagonal(counts, axis1=-2, axis2=-1)
+    sums = (right, counts.sum(-1, dtype=np.float64), counts.sum(-2, dtype=np.float64))
+    return np.stack(sums, axis=-2, dtype=np.float64)
+
+
+def rows(sums: Scores) -> tuple[Scores, ...]:
+    """Split sums (..., M, K) into M arrays (..., K)."""
+    return tuple(sums[..., row, :] for row in range(sums.shape[-2]))
+
+
+def iou(tallies: Scores, absent: Absent) -> Scores:
+    """Compute intersection over union: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18).
+
+    Of counts of boundaries it is ``|G_d and P_d| / |G_d or P_d|``, the boundary IoU.
+    """
+    right, labelled, predicted = rows(tallies)
     return ratio(right, labelled + predicted - right, absent)
 
 
-def recall(counts: Matrices, absent: Absent) -> Scores:
+def recall(tallies: Scores, absent: Absent) -> Scores:
     """Compute ``TP / (TP + FN)`` of each class, "Acc" in the papers' tables."""
-    right, labelled, _ = _sums(counts)
+    right, labelled, _ = rows(tallies)
     return ratio(right, labelled, absent)
 
 
-def precision(counts: Matrices, absent: Absent) -> Scores:
+def precision(tallies: Scores, absent: Absent) -> Scores:
     """Compute ``TP / (TP + FP)`` of each class."""
-    right, _, predicted = _sums(counts)
+    right, _, predicted = rows(tallies)
     return ratio(right, predicted, absent)
 
 
-def f1(counts: Matrices, absent: Absent) -> Scores:
+def f1(tallies: Scores, absent: Absent) -> Scores:
     """Compute ``2 TP / (2 TP + FP + FN)``; released (Temporal): NaN for a class never found."""
-    right, labelled, predicted = _sums(counts)
+    right, labelled, predicted = rows(tallies)
     return ratio(2 * right, labelled + predicted, absent)
 
 
@@ -64,15 +84,16 @@ def class_mean(scores: Scores, scored: Scored = None) -> Scores:
     return _divide(np.where(chosen, scores, 0.0).sum(-1), chosen.sum(-1), np.nan)
 
 
-def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
+def miou(tallies: Scores, absent: Absent, scored: Scored) -> Scores:
     """Average `iou` over the scored classes; that of the tables is of the regions summed."""
-    return _mean(iou, counts, absent, scored)
+    return _mean(iou, tallies, absent, scored)
 
 
-def _mean(score: ByClass, counts: Matrices, absent: Absent, scored: Scored) -> Scores:
+def _mean(score: ByClass, tallies: Scores, absent: Absent, scored: Scored) -> Scores:
     """Average a score over the scored classes; NaN where labels are of one class alone."""
-    is_alone = _is_alone(counts.sum(-1) > 0, scored, absent)
-    return np.where(is_alone, np.nan, class_mean(score(counts, absent), scored))
+    _, labelled, _ = rows(tallies)
+    is_alone = _is_alone(labelled > 0, scored, absent)
+    return np.where(is_alone, np.nan, class_mean(score(tallies, absent), scored))
 
 
 def _is_alone(labelled: NDArray[np.bool_], scored: Scored, absent: Absent) -> NDArray[np.bool_]:
@@ -92,16 +113,10 @@ def variance(region_scores: ArrayLike) -> Scores:
     return class_mean(distances**2)
 
 
-def pixel_accuracy(counts: Matrices) -> Scores:
+def pixel_accuracy(tallies: Scores) -> Scores:
     """Compute the share of valid pixels, of unscored classes too, that are right; NaN: none."""
-    right, labelled, _ = _sums(counts)
+    right, labelled, _ = rows(tallies)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
-
-
-def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
-    """Compute ``|G_d and P_d| / |G_d or P_d|`` of counts of boundaries (..., 3, K)."""
-    both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
-    return ratio(both, label + predicted - both, absent)
 
 
 def ece(counts: Matrices) -> Scores:
@@ -116,26 +131,28 @@ def ece(counts: Matrices) -> Scores:
     return _divide(gaps, number.sum(-1), np.nan)
 
 
-def object_recall(counts: Matrices) -> Scores:
+def object_recall(tallies: Scores) -> Scores:
     """Compute recall among the pixels of objects; NaN without an object of that size."""
-    return recall(counts, "exclude")
+    return recall(tallies, "exclude")
 
 
-MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
+# Tallies -> means over the scored classes (...).
+MEANS: dict[str, Callable[[Scores, Absent, Scored], Scores]] = {
     names.MIOU: miou,
     names.MACC: partial(_mean, recall),
     names.MPRECISION: partial(_mean, precision),
     names.MF1: partial(_mean, f1),
-    names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
+    names.PIXEL_ACCURACY: lambda tallies, _, __: pixel_accuracy(tallies),
 }
 
 
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Compute every score that is followed over a run, by its name in `rgbt.metrics.names`."""
-    whole, scored = counts.whole(), counts.scored
+    by_region, scored = tally(counts.by_region()), counts.scored
+    whole = by_region.sum(0)
     result = _mean_and_variance(counts, absent)
     result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
-    for number, score in enumerate(miou(counts.by_region(), absent, scored), start=1):
+    for number, score in enumerate(miou(by_region, absent, scored), start=1):
         result[names.region(number)] = float(score)
     for name, score in zip(counts.classes, iou(whole, absent), strict=True):
         result[names.class_iou(name)] = float(score)
@@ -146,9 +163,10 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
 
 
 def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
+    by_region = tally(counts.by_region())
     return {
-        names.MIOU: float(miou(counts.whole(), absent, counts.scored)),
-        names.VAR: float(variance(miou(counts.by_region(), absent, counts.scored))),
+        names.MIOU: float(miou(by_region.sum(0), absent, counts.scored)),
+        names.VAR: float(variance(miou(by_region, absent, counts.scored))),
     }
 
 
@@ -193,12 +211,6 @@ def absent_notes(
         where = f"the {split} split" if alone[0] == 0 else where
         notes.append(f"labels of a single class in {where}: a mean over classes is undefined")
     return tuple(notes)
-
-
-def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
-    """Count right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K)."""
-    right = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
-    return right, counts.sum(-1, dtype=np.float64), counts.sum(-2, dtype=np.float64)
 
 
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:

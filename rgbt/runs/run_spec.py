@@ -381,12 +381,15 @@ class RunSpec:
             run = dependency.run
             changed = run.with_seed(run.seed + further if dependency.is_common else seed)
             upstream.append(replace(dependency, run=changed))
-        return replace(
+        found = replace(
             self,
             overrides=(*words, f"seed={seed}"),
             plain={**self.plain, "seed": seed},
             dependencies=tuple(upstream),
         )
+        # No node depends on the seed: those that were checked stay.
+        vars(found).update({name: vars(self)[name] for name in NODES if name in vars(self)})
+        return found
 
     def own_code(self) -> dict[str, str]:
         """Return the digest or version of all code in the run that is not ours (see `code_of`)."""

@@ -52,6 +52,7 @@ class RunReader:
         self.seeds: dict[str, set[int]] = {}
         self.remarks: list[str] = []
         self._counts: dict[tuple[str, Words], Counts] = {}
+        self._counted: set[tuple[str, Words]] = set()
         self._origins: dict[str, Origin] = {}
         for run in runs:
             try:
@@ -85,7 +86,9 @@ class RunReader:
 
     def has_counts(self, run: RunResult, words: Words) -> bool:
         """Return whether a run has the counts of a measurement."""
-        return (run.key, words) in self._counts or stored_at(run, words) is not None
+        if (run.key, words) not in self._counted and stored_at(run, words) is not None:
+            self._counted.add((run.key, words))
+        return (run.key, words) in self._counted
 
     def origin(self, run: RunResult) -> Origin:
         """Return what a run was made of, by its settings and its record."""

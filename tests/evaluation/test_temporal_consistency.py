@@ -30,7 +30,7 @@ from rgbt.evaluation.pairs.count import (
 )
 from rgbt.evaluation.pairs.frames import flow_source, pairs_of
 from rgbt.evaluation.pairs.scenes import FlowRecord, flow_record
-from rgbt.metrics.pairs import ca, tc
+from rgbt.metrics.pairs import ca, frames, tc, triples
 from rgbt.requirements import NetworkRecord
 from rgbt.runs.specify import specify
 from rgbt.transforms.views import read_angles
@@ -245,9 +245,9 @@ def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
     assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
-    assert tc(found.by_region(), "exclude") == pytest.approx(expected, nan_ok=True)
+    assert tc(frames(found.by_region()), "exclude") == pytest.approx(expected, nan_ok=True)
     # The second prediction is the label: all three agree where two do.
-    assert ca(found.by_region(), "exclude") == pytest.approx(expected, nan_ok=True)
+    assert ca(triples(found.by_region()), "exclude") == pytest.approx(expected, nan_ok=True)
     assert np.nanmean(expected) > 0.6
     table = consistency_table({"next": found}, "exclude")
     absent = ", ".join(name for name, n in zip(found.classes, union, strict=True) if n == 0)

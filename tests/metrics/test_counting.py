@@ -20,7 +20,7 @@ from rgbt.metrics.counting import (
 )
 from rgbt.metrics.details import Details
 from rgbt.metrics.metric import Regions
-from rgbt.metrics.scores import boundary_iou, ece, object_recall
+from rgbt.metrics.scores import ece, iou, object_recall, tally
 
 
 def strips(regions: int) -> Regions:
@@ -137,7 +137,7 @@ def test_boundaries_of_square_predicted_one_pixel_to_right() -> None:
     assert found[0, :, 0].tolist() == [24 + 8, 24 + 16, 24 + 11]
     # Without the border of the image: its 24 pixels count where the ring touches them (5).
     assert counted(BOUNDARY, label, prediction)[0].tolist() == [[8, 4], [16, 8], [11 + 5, 8]]
-    ious = boundary_iou(found.sum(0), "released")
+    ious = iou(found.sum(0), "released")
     assert ious.tolist() == pytest.approx([32 / (40 + 35 - 32), 4 / (8 + 8 - 4)])
 
 
@@ -228,7 +228,7 @@ def test_counts_by_size_by_hand() -> None:
     assert areas(objects).tolist() == [[3, 3, math.inf], [3, 1, math.inf]]
     found = counted(Details("size", (2.0,)), label, prediction, objects)
     assert found.tolist() == [[[0, 0], [0, 1]], [[0, 0], [1, 1]], [[1, 1], [0, 0]]]
-    recalls = object_recall(found)
+    recalls = object_recall(tally(found))
     assert recalls[:2, 1].tolist() == [1.0, 0.5]
     assert np.isnan(recalls[0, 0])  # no object of class 0, whatever the convention
     # An object has the same size in every region: 8 pixels in each half, 16 in all.

@@ -17,6 +17,7 @@ from rgbt.metrics.named import (
     details_of_metric,
     images_of,
     parse,
+    sums_of,
     value,
     values,
 )
@@ -166,11 +167,46 @@ def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     counts = pairs_of() if requested.score in {*PAIR_SCORES, *CHANGES} else counts_of()
     by_region = images_of(requested, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
-    found = values(requested, many, counts, "released")
+    sums = sums_of(requested, many, counts.partition)
+    found = values(requested, sums, counts, "released")
     assert found.shape == (3, 1)
-    alone = [values(requested, sums[0], counts, "released") for sums in many]
+    alone = [values(requested, of_one[0], counts, "released") for of_one in sums]
     np.testing.assert_allclose(found[:, 0], alone)
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))
+
+
+@pytest.mark.parametrize(
+    ("counts", "metric"),
+    [
+        *((counts_of(), metric) for metric in ("mIoU", "Var", "class/car/region/2")),
+        *((pairs_of(), metric) for metric in ("TC", "class/car/CA", "warping_error")),
+        (pairs_of(partition="flow2"), "CA"),
+        (pairs_of(partition="triples2"), "flicker"),
+        *((BY_DISTANCE, metric) for metric in ("distance/0-10", "region/2/distance/40-inf")),
+        *((BOUNDARIES, metric) for metric in ("boundary_mIoU", "region/2/boundary_mIoU")),
+        *((CALIBRATED, metric) for metric in ("ECE", "class/road/region/1/ECE")),
+    ],
+)
+def test_sums_of_images_add_up(counts: Counts, metric: str) -> None:
+    requested = parse(metric)
+    by_image = sums_of(requested, counts.counts, counts.partition)
+    whole = sums_of(requested, counts.by_region(), counts.partition)
+    assert by_image.shape == (len(counts.names), *whole.shape)
+    np.testing.assert_array_equal(by_image.sum(0), whole)
+    found = values(requested, whole, counts, "exclude")
+    np.testing.assert_array_equal(found, value(metric, counts, "exclude"))
+
+
+def test_scores_of_equal_sums_read_the_same() -> None:
+    """Means and classes read the same pixels; regions and Var others, and so do day and pairs."""
+    same = [
+        {"mIoU", "mAcc", "class/car", "pixel_accuracy"},
+        {"Var", "region/2", "class/car/region/1"},
+    ]
+    same += [{"day/mIoU", "day/class/car/acc"}, {"TC", "class/car/TC"}, {"CA", "CA_released"}]
+    groups = [{parse(metric).sums for metric in metrics} for metrics in same]
+    assert [len(group) for group in groups] == [1] * len(same)
+    assert len(set.union(*groups)) == len(same)
 
 
 def test_ca_along_an_estimated_flow_is_of_labelled_pixels() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.metrics import pairs
 from rgbt.metrics.counting import pair_counts
-from rgbt.metrics.pairs import ca, ca_released, tc
+from rgbt.metrics.pairs import ca, ca_released, frames, tc, triples
 from rgbt.metrics.scores import class_mean
 from tests.models.golden import FOLDER
 
@@ -23,9 +23,9 @@ LABEL = np.array([[0, 1, 2, 2], [1, 2, 0, 1]], np.uint8)
 @pytest.mark.parametrize("absent", ["released", "exclude"])
 def test_scores_by_hand(absent: Any) -> None:
     counts = pair_counts(FIRST, SECOND, LABEL, 3)
-    np.testing.assert_allclose(tc(counts, absent), [2 / 3, 1 / 4, 2 / 4])
-    np.testing.assert_allclose(ca(counts, absent), [2 / 3, 1 / 5, 1 / 4])
-    np.testing.assert_allclose(ca_released(counts, absent), [2 / 3, 1 / 6, 1 / 7])
+    np.testing.assert_allclose(tc(frames(counts), absent), [2 / 3, 1 / 4, 2 / 4])
+    np.testing.assert_allclose(ca(triples(counts), absent), [2 / 3, 1 / 5, 1 / 4])
+    np.testing.assert_allclose(ca_released(triples(counts), absent), [2 / 3, 1 / 6, 1 / 7])
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -38,14 +38,15 @@ def test_equal_to_sets_of_pixels(masked: bool) -> None:
     label[rng.random(hw) < 0.1] = 255
     chosen = (rng.random(hw) < 0.8) & (label < 9) if masked else np.ones(hw, bool)
     counts = pair_counts(first, second, label, 9, chosen if masked else None)
-    found = [score(counts, "exclude") for score in (tc, ca, ca_released)]
+    three = triples(counts)
+    found = [tc(frames(counts), "exclude"), ca(three, "exclude"), ca_released(three, "exclude")]
     for number in range(9):
         one, two, truth = (
             set(np.flatnonzero((classes == number) & chosen)) for classes in (first, second, label)
         )
-        three = len(one & two & truth)
-        coded = len(one) + len(two) + len(truth) - 2 * three
-        shares = len(one & two) / len(one | two), three / len(one | two | truth), three / coded
+        alike = len(one & two & truth)
+        coded = len(one) + len(two) + len(truth) - 2 * alike
+        shares = len(one & two) / len(one | two), alike / len(one | two | truth), alike / coded
         assert [score[number] for score in found] == pytest.approx(list(shares))
 
 
@@ -59,10 +60,11 @@ def test_the_mean_is_over_sets_not_over_their_pixels(absent: Any, expected: floa
         pair_counts(none + 1, none + 1, none + 1, 2),
     ]
     counts = np.concatenate(sets)
-    assert tc(counts, absent)[0] == ca(counts, absent)[0] == pytest.approx(expected)
-    assert tc(sum(sets), absent)[0] == pytest.approx(1 / 10)
+    assert tc(frames(counts), absent)[0] == pytest.approx(expected)
+    assert ca(triples(counts), absent)[0] == pytest.approx(expected)
+    assert tc(frames(sum(sets)), absent)[0] == pytest.approx(1 / 10)
     with pytest.raises(ValueError, match="expected S x 3 rows, got 8"):
-        tc(counts[1:], absent)
+        frames(counts[1:])
 
 
 @pytest.mark.skipif(not GOLDEN.exists(), reason="reference material is not beside the checkout")
@@ -79,13 +81,14 @@ def test_equal_to_the_released_evaluation(protocol: str, union, absent: Any, mea
         if protocol == "aligned":
             first, valid = golden[f"{name}.p12"], label < 9
         every.append(pair_counts(first, second, label, 9, valid))
-        for key, score in (("tc", tc), ("ca", union)):
+        for key, sums, score in (("tc", frames, tc), ("ca", triples, union)):
             stored = golden[f"{name}.{protocol}.{key}_intersection_union"]
             # Counts of both are below 3072: equal quotients in this precision are equal counts.
             expected = np.divide(*stored, out=np.full(9, np.nan), where=stored[1] > 0)
-            np.testing.assert_allclose(score(every[-1], "exclude"), expected, rtol=1e-14)
-    for key, score in (("tc", tc), ("ca", union)):
-        found = score(sum(every), absent)
+            found = score(sums(every[-1]), "exclude")
+            np.testing.assert_allclose(found, expected, rtol=1e-14)
+    for key, sums, score in (("tc", frames, tc), ("ca", triples, union)):
+        found = score(sums(sum(every)), absent)
         # 1e-10 in the released denominator moves the quotient by less than 1e-12.
         expected = golden[f"consistency.{protocol}.{key}_per_class"]
         np.testing.assert_allclose(found, expected, atol=1e-12, rtol=0)

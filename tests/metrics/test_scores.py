@@ -20,7 +20,7 @@ NAN = np.nan
 
 @pytest.mark.parametrize("absent", ["released", "exclude"])
 def test_two_classes_by_hand(absent: Any) -> None:
-    counts = np.array([[6, 2], [1, 3]])
+    counts = scores.tally(np.array([[6, 2], [1, 3]]))
     # Class 0: TP 6, FN 2, FP 1. Class 1: TP 3, FN 1, FP 2.
     assert scores.iou(counts, absent).tolist() == [6 / 9, 3 / 6]
     assert scores.recall(counts, absent).tolist() == [6 / 8, 3 / 4]
@@ -32,7 +32,7 @@ def test_two_classes_by_hand(absent: Any) -> None:
 
 def test_absent_classes_by_hand() -> None:
     # Class 1 is nowhere; class 2 is predicted but not there; class 3 is there but not predicted.
-    counts = np.array([[4, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0], [2, 0, 0, 0]])
+    counts = scores.tally(np.array([[4, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0], [2, 0, 0, 0]]))
     expected = {
         scores.iou: [4 / 7, NAN, 0, 0],
         scores.recall: [4 / 5, NAN, NAN, 0],
@@ -44,7 +44,7 @@ def test_absent_classes_by_hand() -> None:
         np.testing.assert_array_equal(score(counts, "released"), np.nan_to_num(values))
     assert float(scores.miou(counts, "released", None)) == pytest.approx(4 / 7 / 4)
     assert float(scores.miou(counts, "exclude", None)) == pytest.approx(4 / 7 / 3)
-    nothing = np.zeros((2, 3, 3), int)
+    nothing = scores.tally(np.zeros((2, 4, 4), int))
     assert scores.miou(nothing, "released", None).tolist() == [0, 0]
     assert np.isnan(scores.miou(nothing, "exclude", None)).all()
     assert np.isnan(scores.pixel_accuracy(nothing)).all()
@@ -55,16 +55,17 @@ def test_absent_classes_by_hand() -> None:
 def test_equal_to_the_released_metric_code() -> None:
     stored = np.load(GOLDEN)
     matrix = stored["confusion.matrix"]
+    tallies = scores.tally(matrix)
     score_of = {"precision": scores.precision, "recall": scores.recall, "iou": scores.iou}
     for name, score in score_of.items():
         zero = stored[f"confusion.zero_when_undefined.{name}"]
-        np.testing.assert_allclose(score(matrix, "released"), zero, atol=1e-8)
+        np.testing.assert_allclose(score(tallies, "released"), zero, atol=1e-8)
         for release in ("nan_when_undefined_with_f1", "rtfnet"):
             undefined = stored[f"confusion.{release}.{name}"]
-            np.testing.assert_allclose(score(matrix, "exclude"), undefined, atol=1e-8)
+            np.testing.assert_allclose(score(tallies, "exclude"), undefined, atol=1e-8)
     # F1 of the Temporal release is undefined wherever precision or recall is 0 or undefined.
     expected = stored["confusion.nan_when_undefined_with_f1.f1"]
-    ours, known = scores.f1(matrix, "exclude"), ~np.isnan(expected)
+    ours, known = scores.f1(tallies, "exclude"), ~np.isnan(expected)
     np.testing.assert_allclose(ours[known], expected[known], atol=1e-8)
     there = (matrix.sum(0) + matrix.sum(1)) > 0
     assert (ours[~known & there] == 0).all()

@@ -160,10 +160,10 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         if TC not in HEADLINES[protocol]:
             continue
         for number, name in enumerate(HEADLINES[protocol][:2]):
-            scores = pair_scores(name, counts.by_region(), counts.partition, absent)
+            scores = pair_scores(name, counts, absent)
             by_class[number][protocol] = tuple(map(float, scores))
             means[number][protocol] = float(class_mean(scores, like.scored))
-    there = pair_scores(TC, like.by_region(), like.partition, "exclude")
+    there = pair_scores(TC, like, "exclude")
     lacking = [name for name, tc in zip(like.classes, there, strict=True) if np.isnan(tc)]
     return ConsistencyTable(
         names=like.classes,

@@ -154,6 +154,13 @@ def test_evidence_ignores_order_of_images_and_other_contrasts() -> None:
     assert Resampler(settings).evidence(difference(shuffled)) == plain
 
 
+def test_scores_share_only_the_draws_of_what_they_read() -> None:
+    rows, used = rows_of(), Resampler(SETTINGS)
+    for metric in ("class/car", "mIoU", "Var", "region/2", "pixel_accuracy"):
+        terms = difference(rows, metric)
+        assert used.evidence(terms) == Resampler(SETTINGS).evidence(terms)
+
+
 def test_evidence_again_draws_no_images(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, resampler, calls = rows_of(), Resampler(SETTINGS), []
     draw = ImageBlocks.draws

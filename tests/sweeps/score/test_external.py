@@ -16,7 +16,7 @@ from analysis.uncertainty.contrasts import FIXED
 from rgbt import consistency, evaluate, predict
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import tc
+from rgbt.metrics.pairs import frames, tc
 from rgbt.runs.result import RunResult
 from sweeps.plan.measurement import counts_of, stored_at
 from sweeps.plan.request import TableRequest, external_rows
@@ -152,7 +152,7 @@ def test_weights_have_the_counts_of_their_training_run(
     assert without.partition == expected.partition == "ring5"
     pairs = counts_of(found, ("frames=aligned",))
     scored = score("my/1", TABLE, {("MFNet", 0): outcome}, scale="demo")
-    mean = 100 * tc(pairs.by_region(), "released").mean()
+    mean = 100 * tc(frames(pairs.by_region()), "released").mean()
     assert scored.cells["MFNet", "TC"].mean == pytest.approx(mean)
     assert scored.cells["MFNet", "no RGB"].reason == ""
     assert stored_at(found, ("frames=released",)), "both protocols in one call"
