@@ -5,6 +5,7 @@ Nothing is run: the verdicts come from finished runs, those of the folder and of
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,6 +59,7 @@ def main(options: Options, overrides: list[str]) -> int:
         frame_csv,
     )
 
+    gc.set_threshold(1_000_000, 20, 20)  # many small objects stay
     tables = judge_all(options, overrides)
     frame = claims_frame([claim for table in tables for claim in table.claims])
     run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
@@ -82,7 +84,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
     from rich.progress import track
 
     from analysis.results import finished_runs
-    from sweeps.judge.judged_table import JudgedTable
+    from sweeps.judge.judged_table import JudgedTable, Resamplers
     from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
     from sweeps.plan.request import check_overrides, make_request
@@ -96,6 +98,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
     reader = RunReader(finished_runs(options.runs_dir, options.archive))
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedTable] = []
+    resamplers: Resamplers = {}
     for name in track(names, "judging", console=Console(stderr=True), transient=True):
         if not load_table(name).claims:
             continue
@@ -109,7 +112,9 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
             )
         runs = runs_of_request(request, reader, planner, checked=bool(overrides))
         sizes = network_sizes(request)
-        table = JudgedTable(request=request, runs=runs, sizes=sizes, reader=reader)
+        table = JudgedTable(
+            request=request, runs=runs, sizes=sizes, reader=reader, resamplers=resamplers
+        )
         _ = table.claims  # the slow part, while progress is shown
         judged.append(table)
     return judged

@@ -45,6 +45,9 @@ RESAMPLES = 2_000
 
 SOME_SEEDS = "Some rows have no seed but declared ones."
 
+# By what counts have in common, and how they are drawn; tables share runs, and with them draws.
+Resamplers = dict[tuple[Alike, Resampling], Resampler]
+
 # Of a contrast, the evidence of seeds that were not declared, and that of the declared ones.
 BothSeeds = tuple[Evidence | None, Evidence | None]
 
@@ -67,7 +70,7 @@ class JudgedTable:
     sizes: Mapping[CellId, TableCell] = field(default_factory=dict)
     resamples: int = RESAMPLES
     reader: RunReader = field(default_factory=RunReader)
-    resamplers: dict[Alike, Resampler] = field(default_factory=dict)
+    resamplers: Resamplers = field(default_factory=dict)
 
     @cached_property
     def scored(self) -> ScoredTable:
@@ -103,12 +106,13 @@ class JudgedTable:
 
         Generated scenes are independent, and each world has its own labels.
         """
-        if alike not in self.resamplers:
-            settings = Resampling(resamples=self.resamples, absent=self.request.table.absent)
-            if alike == "names":
-                settings = replace(settings, blocks="none")
-            self.resamplers[alike] = Resampler(settings, alike)
-        return self.resamplers[alike]
+        settings = Resampling(resamples=self.resamples, absent=self.request.table.absent)
+        if alike == "names":
+            settings = replace(settings, blocks="none")
+        place = (alike, settings)
+        if place not in self.resamplers:
+            self.resamplers[place] = Resampler(settings, alike)
+        return self.resamplers[place]
 
     def terms(self, cells: Sequence[Cell]) -> list[Term]:
         """Return the scores of counts, by seed, that a weighted sum of cells is made of.

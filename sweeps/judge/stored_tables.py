@@ -11,7 +11,7 @@ from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.compose import DEFAULT_SCALE, available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
-from sweeps.judge.judged_table import RESAMPLES, JudgedTable
+from sweeps.judge.judged_table import RESAMPLES, JudgedTable, Resamplers
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import REQUESTED, TAG, RowSeed, TableRequest
 from sweeps.plan.table import (
@@ -91,6 +91,7 @@ def judged_tables(
     for each table. Sizes of networks are counted where `counted`, which needs torch. What cannot
     be read or composed is added to `remarks`, one sentence each.
     """
+    resamplers: Resamplers = {}
     requested = _requested(reader, tables, remarks)
     shared = {variant for _, variant in requested if not variant[2]}
     without_runs = []
@@ -104,7 +105,12 @@ def judged_tables(
                 runs = _runs_of_variant(request, rows, reader, planner)
                 sizes = network_sizes(request) if counted and runs and not words else {}
                 judged = JudgedTable(
-                    request=request, runs=runs, sizes=sizes, resamples=resamples, reader=reader
+                    request=request,
+                    runs=runs,
+                    sizes=sizes,
+                    resamples=resamples,
+                    reader=reader,
+                    resamplers=resamplers,
                 )
                 _ = judged.scored, judged.claims  # an error is a remark here
             except InputError as error:

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from rgbt.checks import InputError
@@ -16,7 +15,6 @@ from rgbt.runs.needs import Lacking, lacking
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.specify import requested_run, specify
-from sweeps.plan import row_cache
 from sweeps.point import Outcome, Point, State
 
 
@@ -57,7 +55,6 @@ class Planner:
         self.base = tuple(base)  # overrides that all runs have, e.g. the folder of runs
         self._fingerprints: dict[str, str] = {}
         self._specified: dict[tuple[str, ...], RunSpec] = {}
-        self._requested: dict[tuple[str, ...], RunSpec] = {}
         self._checked: set[tuple[str, ...]] = set()
 
     def plan(self, point: Point) -> PlannedPoint:
@@ -85,7 +82,7 @@ class Planner:
     def composed(self, point: Point) -> RunSpec | None:
         """Return the first run of a point, unchecked; None where it cannot be composed."""
         try:
-            return self._composed((*self.base, *point.runs()[0]), checked=False)
+            return self.specify((*self.base, *point.runs()[0]), checked=False)
         except InputError:
             return None
 
@@ -104,33 +101,16 @@ class Planner:
     def specify(self, overrides: tuple[str, ...], *, checked: bool = True) -> RunSpec:
         """Return the specification of one run (`specify_run`).
 
-        An unchecked one says which finished runs belong to a row, and nothing is built of it; it
-        may be stored (`sweeps.plan.row_cache`).
+        Runs that differ in their last override alone, a seed, are composed once.
         """
-        if checked:
-            return self._composed(overrides, checked=True)
-        same, seed = _without_seed(overrides)
-        if same not in self._requested:
-            compose = partial(self._composed, same, checked=False)
-            self._requested[same] = row_cache.requested(same, compose)
-        run = self._requested[same]
-        return run if seed is None else run.with_seed(seed)
-
-    def _composed(self, overrides: tuple[str, ...], *, checked: bool) -> RunSpec:
-        """Return the same; runs that differ in the seed at the end alone are composed once."""
-        same, seed = _without_seed(overrides)
+        *others, last = overrides
+        seed = last.removeprefix("seed=")
+        is_seed = seed != last and seed.isdecimal()
+        same = tuple(others) if is_seed else overrides
         if same not in self._specified:
             self._specified[same] = specify_run(overrides, checked=False)
         run = self._specified[same]
         if checked and same not in self._checked:
             run.check()
             self._checked.add(same)
-        return run if seed is None else run.with_seed(seed)
-
-
-def _without_seed(overrides: tuple[str, ...]) -> tuple[tuple[str, ...], int | None]:
-    """Return the overrides, and the seed apart where it is the last of them."""
-    *others, last = overrides
-    seed = last.removeprefix("seed=")
-    is_seed = seed != last and seed.isdecimal()
-    return (tuple(others), int(seed)) if is_seed else (overrides, None)
+        return run.with_seed(int(seed)) if is_seed else run

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.config.overrides import composing
-from sweeps.plan import row_cache
 from sweeps.plan.request import TableRequest
 from sweeps.score.cells import NO_VALUE, CellId, TableCell
 
@@ -45,13 +44,8 @@ def network_sizes(request: TableRequest) -> dict[CellId, TableCell]:
 def million_parameters(overrides: tuple[str, ...]) -> float:
     """Count the millions of parameters of the network that overrides of a run describe.
 
-    It is built on torch's device "meta", once for the same files (`sweeps.plan.row_cache`).
-    Discriminators are not counted. InputError: as refused.
+    It is built on torch's device "meta". Discriminators are not counted. InputError: as refused.
     """
-    return row_cache.size(overrides, partial(_counted, overrides))
-
-
-def _counted(overrides: tuple[str, ...]) -> float:
     import torch
 
     with composing(overrides), torch.device("meta"):
