@@ -70,7 +70,7 @@ def _ranked(judged: JudgedTable, column: Column) -> dict[str, Any] | None:
     seen: set[tuple[str, ...]] = set()
     ours, errors, freedoms, printed, kinds = [], [], [], [], set()
     for row in judged.request.table.rows:
-        cell, value = judged.scored.cells.get((row.label, column.name)), published(row, column)
+        cell, value = judged.values.cells.get((row.label, column.name)), published(row, column)
         if cell is None or value is None or math.isnan(cell.mean) or cell.keys in seen:
             continue
         seen.add(cell.keys)

@@ -73,19 +73,24 @@ class JudgedTable:
     resamplers: Resamplers = field(default_factory=dict)
 
     @cached_property
-    def scored(self) -> ScoredTable:
-        """Our values, with marks of the best rows (`score`)."""
-        request, table = self.request, self.request.table
+    def values(self) -> ScoredTable:
+        """Our values, without marks."""
+        request = self.request
         scored = score(
             request.name,
-            table,
+            request.table,
             self.runs,
             scale=request.scale,
             sizes=self.sizes,
             reader=self.reader.counts,
         )
-        marks = self._marks(scored) | size_marks(table, self.sizes)
-        return replace(scored, form=request.form, marks=marks)
+        return replace(scored, form=request.form)
+
+    @cached_property
+    def scored(self) -> ScoredTable:
+        """Our values, with marks of the best rows (`score`)."""
+        marks = self._marks(self.values) | size_marks(self.request.table, self.sizes)
+        return replace(self.values, marks=marks)
 
     @cached_property
     def claims(self) -> list[JudgedClaim]:
