@@ -120,7 +120,7 @@ def paper_section(
     frame = claims_of(own)
     is_run = frame["verdict"] != NOT_RUN
     of_paper = contrasts[contrasts["paper"] == name]
-    of_tables = ranks[ranks["table"].isin([table.judged.request.name for table in own])]
+    own_ranks = ranks[ranks["table"].isin([table.judged.request.name for table in own])]
     forest = forest_of(of_paper, title)
     of_tables = frame["table"].str.split("/").str[-1]
     lines = "- " + of_tables + ", `" + frame["claim"] + "`: " + frame["says"]
@@ -132,7 +132,7 @@ def paper_section(
         "counted": counted(frame),
         "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
         "not_run": "\n".join(lines[~is_run]),
-        "agreement": agreement_lines(signs_of(of_paper), of_tables),
+        "agreement": agreement_lines(signs_of(of_paper), own_ranks),
         "forest": forest,
         "picture": f"{name}_contrasts.svg" if forest is not None else "",
     }
