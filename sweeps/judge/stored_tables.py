@@ -41,19 +41,21 @@ def runs_of_request(
 ) -> dict[RowSeed, Outcome]:
     """Return the finished runs of every row by their keys; rows that cannot be composed have none.
 
-    A row is composed if a finished run is of its experiment, or if its settings are `checked`.
+    A row is composed if a finished run is of its experiment and not of another scale, or if its
+    settings are `checked`.
+
     InputError: no row can be composed.
     """
     runs: dict[RowSeed, Outcome] = {}
     errors = []
     for row in request.trained_rows:
         words = request.overrides(row.label, 0)
-        seeds = reader.seeds.get(words[0].removeprefix("+experiment="), set())
+        seeds = reader.seeds(words[0].removeprefix("+experiment="), request.scale)
         if not checked and not seeds:
             continue
         try:
             spec = planner.specify((*planner.base, *words), checked=checked)
-            found = {seed: reader.find(spec.with_seed(seed)) for seed in sorted(seeds)}
+            found = {seed: reader.find(spec.with_seed(seed)) for seed in seeds}
         except InputError as error:
             errors.append(error)
             continue

@@ -43,30 +43,36 @@ class RunReader:
 
     Attributes:
         by_seed: the runs that a row of a table may be, by seed and key.
-        seeds: the seeds of every experiment.
         remarks: one sentence on each run that has no seed or no experiment.
     """
 
     def __init__(self, runs: Iterable[RunResult] = ()) -> None:
         self.by_seed: dict[int, dict[str, RunResult]] = {}
-        self.seeds: dict[str, set[int]] = {}
         self.remarks: list[str] = []
         self._counts: dict[tuple[str, Words], Counts] = {}
         self._counted: set[tuple[str, Words]] = set()
         self._origins: dict[str, Origin] = {}
+        self._seeds: dict[tuple[str, str], set[int]] = {}  # by experiment and typed scale
         for run in runs:
             try:
                 tags = run.tags
                 seed, experiment = int(tags[SEED]), tags[EXPERIMENT]
+                typed = [word for word in run.description.overrides if word.startswith("scale=")]
             except ODD as error:
                 self.remarks.append(f"Run {run.key} belongs to no table: {error!r}.")
                 continue
             self.by_seed.setdefault(seed, {})[run.key] = run
-            self.seeds.setdefault(experiment, set()).add(seed)
+            scale = typed[-1].removeprefix("scale=") if typed else ""
+            self._seeds.setdefault((experiment, scale), set()).add(seed)
 
     def __iter__(self) -> Iterator[RunResult]:
         for runs in self.by_seed.values():
             yield from runs.values()
+
+    def seeds(self, experiment: str, scale: str) -> list[int]:
+        """Return the seeds of the runs of an experiment, but of those at another scale."""
+        places = ((experiment, scale), (experiment, ""))
+        return sorted({seed for place in places for seed in self._seeds.get(place, ())})
 
     def find(self, spec: RunSpec) -> RunResult | None:
         """Return the run of a specification (`RunSpec.is_run`)."""
