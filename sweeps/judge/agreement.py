@@ -122,17 +122,20 @@ def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
     rows: dict[Scores, dict[str, Any]] = {}
     for judged in tables:
         for claim in judged.claims:
-            for single in () if claim.is_level else claim.contrasts:
-                if single.printed is None:
-                    continue
-                decides = single.label == claim.label and not claim.same_as
-                for scores in (single.scores, negated(single.scores)):
-                    if scores in rows:
-                        rows[scores]["decides"] |= decides
-                        break
-                else:
-                    rows[single.scores] = {**_contrast(claim, single), "decides": decides}
+            if not claim.is_level:
+                _add_contrasts(claim, rows)
     return pd.DataFrame(list(rows.values()), columns=CONTRASTS)
+
+
+def _add_contrasts(claim: JudgedClaim, rows: dict[Scores, dict[str, Any]]) -> None:
+    """Add the contrasts of a claim, by their scores; one that is known may decide this claim."""
+    for single in claim.contrasts:
+        if single.printed is None:
+            continue
+        opposite = negated(single.scores)
+        place = opposite if opposite in rows else single.scores
+        row = rows.setdefault(place, {**_contrast(claim, single), "decides": False})
+        row["decides"] |= single.label == claim.label and not claim.same_as
 
 
 def _contrast(claim: JudgedClaim, single: JudgedClaim) -> dict[str, Any]:
