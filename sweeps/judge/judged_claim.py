@@ -94,12 +94,12 @@ class JudgedClaim:
 
     @property
     def size(self) -> str:
-        """Our interval beside the printed difference: "as printed", "larger", ...; "": unknown."""
+        """Our interval beside the printed difference: "includes it", "larger", ...; "": unknown."""
         if self.printed is None or self.verdict is None or self.verdict.interval is None:
             return ""
         low, high = self.verdict.interval.low, self.verdict.interval.high
         if low <= self.printed <= high:
-            return "as printed"
+            return "includes it"
         if low <= 0 <= high or self.printed * (low + high) > 0:
             return "larger" if min(abs(low), abs(high)) > abs(self.printed) else "smaller"
         return "other sign"

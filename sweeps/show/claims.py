@@ -24,6 +24,13 @@ NOTES = (
     "difference as large as ours.",
 )
 AS_CLAIMED, OTHERWISE = ("holds", "same direction"), ("contradicted", "opposite direction")
+# Words before the printed difference.
+SIZES = {
+    "includes it": "which includes the",
+    "larger": "larger than the",
+    "smaller": "smaller than the",
+    "other sign": "of another sign than the",
+}
 OPEN = ("undecided", "not shown")
 # Word in the column of seeds for a difference of two evaluations without seeds.
 IMAGES = "images alone"
@@ -246,8 +253,7 @@ def statement(row: pd.Series) -> str:
     text = f"{row['says']} **{word.capitalize()}**{where}: "
     text += f"{_signed(row['estimate'])} {_interval(row)}"
     if row["size"]:
-        than = "" if row["size"] == "as printed" else " than printed"
-        text += f", {row['size']}{than} ({_signed(row['printed'])})"
+        text += f", {SIZES[row['size']]} printed {_signed(row['printed'])}"
     return f"{text}; {_rests_on(row)}."
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from analysis.archive import _compared
-from sweeps.show.claims import statement
+from sweeps.show.claims import SIZES, statement
 from sweeps.show.pages import MARKED, Report
 from tests.declarations import confirming, has_history, undeclared
 
@@ -72,8 +72,9 @@ def test_no_verdict_is_worded_as_of_a_paper_that_is_not_of_its_runs(report: Repo
             assert f"on {row['images']}" in text, where
             assert row["basis"] == "confirmation" or "not confirmed" in text, where
             is_inside = row["low"] <= row["printed"] <= row["high"]
-            assert is_inside or row["printed"] != row["printed"] or row["size"] in text, where
-            assert is_inside or row["size"] != "as printed", where
+            assert is_inside or row["printed"] != row["printed"] or row["size"] in SIZES, where
+            assert is_inside or row["size"] != "includes it", where
+            assert not row["size"] or SIZES[row["size"]] in text, where
 
 
 def test_quoted_claims_are_confirmed_or_said_not_to_be(report: Report) -> None:
