@@ -44,12 +44,14 @@ def undeclared(root: Path, path: Path, table: Table, claim: Claim, run: RunResul
         return f"{run.key}: commit {commit[:8]} has no such table"
     if before.confirm != table.confirm:
         return f"{run.key}: commit {commit[:8]} declares the seeds {before.confirm}"
-    if _asked(claim) not in [_asked(other) for other in before.claims if not other.exploratory]:
+    if _without_words(claim) not in [
+        _without_words(other) for other in before.claims if not other.exploratory
+    ]:
         return f"{run.key}: commit {commit[:8]} does not declare '{claim.name}'"
     return ""
 
 
-def _asked(claim: Claim) -> Claim:
+def _without_words(claim: Claim) -> Claim:
     """A claim without its words."""
     return replace(claim, says="", source="", remarks=())
 

@@ -176,7 +176,7 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
 
     found = []
     for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
-        ours = group["confirmed"].fillna(group["explored"])
+        ours = ours_of(group)
         low = group["confirmed_low"].fillna(group["explored_low"])
         high = group["confirmed_high"].fillna(group["explored_high"])
         known = ours.notna() & (group["printed"] != 0)
@@ -189,6 +189,11 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
         of_decided = ((alike & decided).sum(), decided.sum())
         found.append((images, scale, alike.sum(), known.sum(), *ends, *of_decided))
     return pd.DataFrame(found, columns=SIGNS)
+
+
+def ours_of(contrasts: pd.DataFrame) -> pd.Series:
+    """Return our differences: confirmed, or explored."""
+    return contrasts["confirmed"].fillna(contrasts["explored"])
 
 
 def _share_interval(alike: Values, every: Values) -> tuple[float, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ from rgbt.checks import InputError
 from rgbt.tables import ABSENT
 from sweeps.judge.contrasts import Cell
 from sweeps.judge.judged_table import JudgedTable
+from sweeps.judge.seeds import with_seeds
 from sweeps.plan.design import TESTED, TRAINED, Design, sign_of
 
 if TYPE_CHECKING:
@@ -103,11 +103,7 @@ def _evidences(
     """The evidence about every cell, by these seeds alone."""
     evidences = []
     for cell in cells:
-        terms = []
-        for term in cell:
-            counts = {seed: term.counts[seed] for seed in seeds}
-            keys = {seed: term.keys[seed] for seed in seeds}
-            terms.append(replace(term, counts=counts, keys=keys))
+        terms = [with_seeds(term, seeds) for term in cell]
         evidences.append(judged.resampler("names").evidence(terms))
     return evidences
 

@@ -110,8 +110,8 @@ class JudgedClaim:
         return self.claim.range if self.of_paper else self.claim.direction
 
     @property
-    def asked(self) -> tuple[Range, str]:
-        """What it asks of `compared`: that A is above B is as much as that B is below A."""
+    def requirement(self) -> tuple[Range, str]:
+        """What it requires of `compared`: that A is above B is as much as that B is below A."""
         low, high = self.wanted
         is_lower = self.claim.expected == "lower"
         return ((-high, -low) if is_lower else (low, high)), self.claim.combine

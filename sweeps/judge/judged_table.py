@@ -100,9 +100,9 @@ class JudgedTable:
         for claim in self.request.table.claims:
             found = self._judge(claim)
             if found.contrasts:
-                asked = (found.compared, found.asked)
-                found = replace(found, same_as=first.get(asked, ""))
-                first.setdefault(asked, claim.name)
+                place = (found.compared, found.requirement)
+                found = replace(found, same_as=first.get(place, ""))
+                first.setdefault(place, claim.name)
             judged.append(found)
         return judged
 

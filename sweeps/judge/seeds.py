@@ -30,7 +30,7 @@ def of_others(terms: Sequence[Term], declared: Collection[int]) -> list[Term]:
         if not seeds:
             names = ", ".join(map(str, sorted(declared)))
             raise InputError(f"not all of the declared seeds {names} are finished.")
-        found.append(_with_seeds(term, seeds))
+        found.append(with_seeds(term, seeds))
     return found
 
 
@@ -42,10 +42,11 @@ def of_declared(terms: Sequence[Term], declared: Collection[int]) -> list[Term]:
         return []
     if any(not term.fixed and not term.counts.keys() >= set(seeds) for term in terms):
         return []
-    return [term if term.fixed else _with_seeds(term, seeds) for term in terms]
+    return [term if term.fixed else with_seeds(term, seeds) for term in terms]
 
 
-def _with_seeds(term: Term, seeds: Sequence[int]) -> Term:
+def with_seeds(term: Term, seeds: Sequence[int]) -> Term:
+    """Return a term with these seeds alone."""
     counts = {seed: term.counts[seed] for seed in seeds}
     return replace(term, counts=counts, keys={seed: term.keys[seed] for seed in seeds})
 

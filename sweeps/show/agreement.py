@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable
+from sweeps.judge.agreement import ours_of
 from sweeps.show.figure import OURS, PUBLISHED
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def ranks_grid(ranks: pd.DataFrame) -> TextTable:
 
 def signs_grid(contrasts: pd.DataFrame) -> TextTable:
     """Count the contrasts of each table whose sign is the printed one."""
-    ours = contrasts["confirmed"].fillna(contrasts["explored"])
+    ours = ours_of(contrasts)
     frame = contrasts.assign(alike=ours * contrasts["printed"] > 0, ours=ours)
     frame = frame[frame["ours"].notna() & (frame["printed"] != 0)]
     rows = []
@@ -91,7 +92,7 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
     """
     from analysis.figures.plots import new_figure
 
-    ours = contrasts["confirmed"].fillna(contrasts["explored"])
+    ours = ours_of(contrasts)
     frame = contrasts.assign(ours=ours)[contrasts["decides"] & ours.notna()]
     if frame.empty:
         return None
