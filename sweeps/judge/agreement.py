@@ -177,8 +177,9 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     found = []
     for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
         ours = ours_of(group)
-        low = group["confirmed_low"].fillna(group["explored_low"])
-        high = group["confirmed_high"].fillna(group["explored_high"])
+        is_confirmed = group["confirmed"].notna()
+        low = group["confirmed_low"].where(is_confirmed, group["explored_low"])
+        high = group["confirmed_high"].where(is_confirmed, group["explored_high"])
         known = ours.notna() & (group["printed"] != 0)
         alike = known & (ours * group["printed"] > 0)
         decided = known & ((low > 0) | (high < 0))

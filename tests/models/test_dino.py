@@ -378,3 +378,12 @@ def test_thermal_vector_starts_at_0_and_reaches_thermal_alone() -> None:
     net.backbone.thermal_embedding.add_(torch.arange(8.0))
     after = [net(*pair, views=(view,)).logits for view in ("rgb", "thermal")]
     assert [torch.equal(a, b) for a, b in zip(before, after, strict=True)] == [True, False]
+
+
+@pytest.mark.parametrize("off", ["thermal_embedding", "lora_per_modality", "pixel_decoder_fp32"])
+def test_switches_of_equal_defaults_are_read_for_themselves(off: str) -> None:
+    switches = {"thermal_embedding": True, "lora_per_modality": True, "pixel_decoder_fp32": True}
+    net = nano(tuning="lora", **(switches | {off: False}))
+    assert (net.backbone.thermal_embedding is None) == (off == "thermal_embedding")
+    assert (set(net.backbone.lora) == {"both"}) == (off == "lora_per_modality")
+    assert (not net.sem_seg_head.pixel_decoder.fp32) == (off == "pixel_decoder_fp32")

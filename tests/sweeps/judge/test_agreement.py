@@ -86,6 +86,19 @@ def test_signs_of_different_contrasts_are_counted_once() -> None:
     assert "0 below" in lines[0]
 
 
+def test_a_confirmation_without_interval_is_not_decided_by_exploration() -> None:
+    both = contrasts_frame([made("p/one", SHARES)])
+    for end in ("low", "high"):
+        both[f"explored_{end}"] = both[f"confirmed_{end}"]
+    both["confirmed_low"] = both["confirmed_high"] = math.nan
+    (found,) = signs_of(both).to_dict("records")
+    assert (found["alike"], found["decided"]) == (2, 0)
+    (found,) = signs_of(both.assign(confirmed=math.nan, explored=both["confirmed"])).to_dict(
+        "records"
+    )
+    assert (found["alike"], found["decided"]) == (2, 3)
+
+
 def test_agreement_is_shown_and_drawn() -> None:
     tables = [made("p/one", SHARES)]
     contrasts = contrasts_frame(tables)
