@@ -196,6 +196,17 @@ DINOV3 = Kind(
 )
 
 
+# EfficientNet-Lite. The head of the classifier has a normalisation with the name of no branch.
+LITE = Kind(
+    "ImageNet EfficientNet-Lite",
+    has=("_conv_stem.", "_bn0.", "_blocks.0._depthwise_conv."),
+    source=renaming((r"^backbone\.encoders\.(rgb|thermal)\.", "")),
+    unused=r"_(conv_head|bn1|fc)\.",
+    fresh=r"backbone\.(encoders\.\w+\.mask_token$|norms\.|norm_layers\.)|sem_seg_head\.",
+    convention=("model/inputs=lite",),
+)
+
+
 # Module of rgbt.models -> kinds of files for its networks, in the order they are tried.
 KINDS: Mapping[str, tuple[Kind, ...]] = {
     "mask2former": (CRM, replace(CRM, prefix=""), SWIN, TIMM_SWIN),
@@ -257,6 +268,7 @@ KINDS: Mapping[str, tuple[Kind, ...]] = {
             fresh=r"(ppm|cls|aux)\.",
         ),
     ),
+    "efficientnet_lite": (LITE,),
     "deeplabv2": (CAFFE_RESNET, DEEPLAB_RESNET),
     "dinov2": (
         replace(DINOV2, has=(*DINOV2.has, "register_tokens"), convention=SIZE),

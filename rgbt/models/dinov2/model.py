@@ -24,17 +24,10 @@ from rgbt.models.mask2former.network import (
     MaskNetwork,
     NumQueries,
 )
+from rgbt.models.parts import ChannelNorm
 from rgbt.ranges import Blocks, Channels, Epsilon, MlpRatio, NumClasses, Positive
 
 STRIDES = (4, 8, 16, 32)
-
-
-class ChannelNorm(nn.LayerNorm):
-    """Normalises the channels of every pixel of maps."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        """(N, C, h, w) -> (N, C, h, w)."""
-        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 def pyramid_level(dim: int, *, token_px: int, stride: int) -> nn.Sequential:
