@@ -39,7 +39,8 @@ class Term:
     """One score (`rgbt.metrics.named`) in a linear contrast.
 
     Attributes:
-        counts: by seed; the same images in all terms. `{FIXED: counts}` for a method without seeds.
+        counts: by seed; of one seed the same images in all terms. Folds of a cross-validation are
+            seeds with other images. `{FIXED: counts}` for a method without seeds.
         keys: by seed, identity of the counts: equal keys, equal counts.
     """
 
@@ -123,9 +124,9 @@ class Resampler:
         self._ordered: dict[str, Counts] = {}
         self._compared: set[tuple[str, str]] = set()
         self._sums: dict[tuple[object, ...], Values] = {}
-        self._resampled: dict[tuple[str, str, Absent, bytes], Values] = {}
+        self._resampled: dict[tuple[str, str, Absent, tuple[str, ...], bytes], Values] = {}
         self._values: dict[tuple[str, str, Absent], float] = {}
-        self._influences: dict[tuple[str, Absent], Values] = {}
+        self._influences: dict[tuple[str, Absent, tuple[str, ...]], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
         """Do the same as `contrast`, with an InputError where a run has nothing to score."""
@@ -155,7 +156,7 @@ class Resampler:
         seeds = _common_seeds(terms) if paired else ()
         every = [counts for term in terms for counts in term.counts.values()]
         absent = self._settings.absent or convention(every)
-        runs = [self._runs(terms[0], term, seeds) for term in terms]
+        runs = _among_all([self._runs(terms[0], term, seeds) for term in terms])
         first = next(iter(runs[0].values()))
         blocks = make_blocks(first.names, self._settings.blocks, self._series(terms, runs, absent))
         used = blocks.count
@@ -186,13 +187,18 @@ class Resampler:
         )
 
     def _runs(self, reference: Term, term: Term, seeds: Sequence[int]) -> dict[str, Counts]:
-        """Return the counts of the used seeds by key, images in the order of their names."""
+        """Return the counts of the used seeds by key, images in the order of their names.
+
+        Of a seed, the images are those of the reference, or of its first seed where it has none.
+        """
         firsts = [seed for seed in seeds if seed in reference.counts] or sorted(reference.counts)
-        name, found = reference.keys[firsts[0]], {}
+        found = {}
         for seed in seeds if seeds and not term.fixed else sorted(term.counts):
             key = term.keys[seed]
+            like = seed if seed in reference.counts else firsts[0]
+            name = reference.keys[like]
             if (name, key) not in self._compared:
-                same = in_order(reference.counts[firsts[0]], term.counts[seed], self._alike)
+                same = in_order(reference.counts[like], term.counts[seed], self._alike)
                 names = tuple(sorted(same.names))
                 self._ordered[key] = same if same.names == names else same.select(names)
                 self._compared.add((name, key))
@@ -219,13 +225,14 @@ class Resampler:
 
     def _influence(self, key: str, counts: Counts, absent: Absent) -> Values:
         """Return the `watched` scores (L, N) of all images but one."""
-        if (key, absent) not in self._influences:
+        place = (key, absent, counts.names)
+        if place not in self._influences:
             series = []
             for metric in watched(counts):
                 by_image = sums_of(metric, counts.counts, counts.partition)
                 series.append(values(metric, by_image.sum(0) - by_image, counts, absent))
-            self._influences[key, absent] = np.stack(series)
-        return self._influences[key, absent]
+            self._influences[place] = np.stack(series)
+        return self._influences[place]
 
     def _value(self, metric: str, key: str, counts: Counts, absent: Absent) -> float:
         """Return the score of all images."""
@@ -237,21 +244,26 @@ class Resampler:
         self, metric: str, runs: Mapping[str, Counts], blocks: ImageBlocks, absent: Absent
     ) -> list[Values]:
         """Return (resamples,) scores of each run with blocks drawn anew; NaN: nothing to score."""
-        place, missing = (metric, absent, blocks.index.tobytes()), {}
+        images = next(iter(runs.values())).names  # further folds have further images
+        place, missing = (metric, absent, images, blocks.index.tobytes()), {}
         for key, counts in runs.items():
             if (key, *place) not in self._resampled:
                 missing[key] = counts
         parsed, scores = parse(metric), {key: list[Values]() for key in missing}
-        for key, sums in self._drawn_sums(parsed, missing, blocks):
+        for key, sums in self._drawn_sums(parsed, missing, images, blocks):
             scores[key].append(values(parsed, sums, missing[key], absent))
         self._resampled |= {(key, *place): np.concatenate(scores[key]) for key in missing}
         return [self._resampled[key, *place] for key in runs]
 
     def _drawn_sums(
-        self, metric: ParsedMetric, runs: Mapping[str, Counts], blocks: ImageBlocks
+        self,
+        metric: ParsedMetric,
+        runs: Mapping[str, Counts],
+        images: tuple[str, ...],
+        blocks: ImageBlocks,
     ) -> Iterator[tuple[str, Values]]:
         """Yield keys with drawn sums (..., M, K) that the metric reads, some resamples at once."""
-        place = (metric.sums, blocks.index.tobytes())
+        place = (metric.sums, images, blocks.index.tobytes())
         to_draw = {}
         for key, counts in runs.items():
             if (key, *place) in self._sums:
@@ -270,6 +282,24 @@ class Resampler:
         self._sums |= {(key, *place): np.concatenate(parts) for key, parts in drawn.items()}
         while sum(sums.size for sums in self._sums.values()) > KEPT:
             del self._sums[next(iter(self._sums))]  # the oldest
+
+
+def _among_all(runs: Sequence[Mapping[str, Counts]]) -> list[dict[str, Counts]]:
+    """Return runs as counts of the images of all of them, in the order of their names."""
+    first = next(iter(runs[0].values())).names
+    if all(counts.names == first for of_term in runs for counts in of_term.values()):
+        return [dict(of_term) for of_term in runs]
+    nights: dict[str, bool | None] = {}
+    for of_term in runs:
+        for counts in of_term.values():
+            nights |= zip(counts.names, counts.night or [None] * len(counts.names), strict=True)
+    every = tuple(sorted(nights))
+    known = [nights[name] for name in every]
+    night = None if None in known else tuple(map(bool, known))
+    found = []
+    for of_term in runs:
+        found.append({key: counts.among(every, night) for key, counts in of_term.items()})
+    return found
 
 
 def watched(like: Counts) -> tuple[ParsedMetric, ...]:

@@ -37,7 +37,7 @@ OWN_FOLDERS = "RGBT_CONF"  # names them for every composition, with commas (conf
 DEFAULT_SCALE = "demo"  # of a run without ``scale=...``
 
 # Scale -> scale whose files it has, where a choice by scale does not name it.
-SAME_FILES = {"bench": "demo"}
+SAME_FILES = {"bench": "demo", "real": "paper"}
 
 VARIANTS = "_variants_"  # choices of a group that differ from their file in a few values
 

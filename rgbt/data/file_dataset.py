@@ -23,6 +23,9 @@ from rgbt.types import Sample
 # Split -> its list file, or several, whose names are all in the split.
 Lists = Mapping[str, str | tuple[str, ...]]
 
+# Beginning of the name of a list that comes with rgbt, and where these lists are.
+OURS, LISTS = "rgbt:", Path(__file__).with_name("lists")
+
 # Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
 
@@ -128,11 +131,16 @@ class FileDataset:
     def lines(self, split: str) -> tuple[str, ...]:
         """Return lines of the lists of a split, files below the root or anywhere; () without one.
 
+        ``rgbt:NAME`` is a list that comes with rgbt (``rgbt/data/lists``).
+
         InputError: of several lists one is missing, or two have a line in common.
         """
         key = f"{self.splits_key}.{split}"
         files = self.files_of.get(split, (self.splits[split],))
-        paths = [self.root / Path(file).expanduser() for file in files]
+        paths = []
+        for file in files:
+            ours = LISTS / file.removeprefix(OURS)
+            paths.append(ours if file.startswith(OURS) else self.root / Path(file).expanduser())
         if len(paths) == 1 and not os.path.lexists(paths[0]):
             return ()
         found = [name for path in paths for name in read_names(path, key)]

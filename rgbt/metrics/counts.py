@@ -108,6 +108,18 @@ class Counts:
             raise InputError(f"'{self.split}': image '{min(missing)}' is not counted.")
         return self._take([index_of[name] for name in wanted])
 
+    def among(self, names: tuple[str, ...], night: tuple[bool, ...] | None) -> Counts:
+        """Return the counts of these images, 0 for those that are not counted here.
+
+        `night` says which of `names` were taken at night.
+        """
+        if self.names == names:
+            return self
+        index_of = {name: index for index, name in enumerate(names)}
+        counts = np.zeros((len(names), *self.counts.shape[1:]), self.counts.dtype)
+        counts[[index_of[name] for name in self.names]] = self.counts
+        return replace(self, counts=counts, names=names, night=night)
+
     def added(self, number: int) -> Counts:
         """Add the counts of every `number` neighbours; day and night stay apart.
 

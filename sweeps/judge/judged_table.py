@@ -111,7 +111,9 @@ class JudgedTable:
 
         Generated scenes are independent, and each world has its own labels.
         """
-        settings = Resampling(resamples=self.resamples, absent=self.request.table.absent)
+        table = self.request.table
+        blocks = table.blocks.get(self.request.scale, "auto")
+        settings = Resampling(resamples=self.resamples, absent=table.absent, blocks=blocks)
         if alike == "names":
             settings = replace(settings, blocks="none")
         place = (alike, settings)

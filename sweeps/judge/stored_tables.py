@@ -49,19 +49,16 @@ def runs_of_request(
     runs: dict[RowSeed, Outcome] = {}
     errors = []
     for row in request.trained_rows:
-        words = request.overrides(row.label, 0)
-        seeds = reader.seeds(words[0].removeprefix("+experiment="), request.scale)
-        if not checked and not seeds:
-            continue
+        experiment = request.overrides(row.label, 0)[0]
+        seeds = reader.seeds(experiment.removeprefix("+experiment="), request.scale)
         try:
-            spec = planner.specify((*planner.base, *words), checked=checked)
-            found = {seed: reader.find(spec.with_seed(seed)) for seed in seeds}
+            for seed in seeds or ([0] if checked else []):
+                words = request.overrides(row.label, seed)
+                run = reader.find(planner.specify((*planner.base, *words), checked=checked))
+                if run is not None:
+                    runs[row.label, seed] = _finished(row.label, run)
         except InputError as error:
             errors.append(error)
-            continue
-        for seed, run in found.items():
-            if run is not None:
-                runs[row.label, seed] = _finished(row.label, run)
     if errors and len(errors) == len(request.trained_rows):
         raise errors[0]  # the command is wrong, and not a row
     return runs

@@ -99,7 +99,8 @@ class TableRequest:
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
         file = self.pretrained.get(_model_of(others))
         weights = () if file is None else readable_paths([f"model.weights={file}"])
-        return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
+        fold = self.table.of_fold(self.scale, seed)
+        return (experiment, *scale, *fold, *others, *self.extra, *weights, f"seed={seed}")
 
     @property
     def trained_rows(self) -> list[Row]:

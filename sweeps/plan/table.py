@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import MinLen
+from annotated_types import Interval, MinLen
 from pydantic import AfterValidator, BeforeValidator, NonNegativeInt, model_validator
 
+from analysis.uncertainty.blocks import NamedBlocks
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import available, chosen_scale
 from rgbt.config.values import check_value
@@ -175,6 +176,10 @@ class Table(Strict):
         data: what the printed values were measured on.
         lists: which lists the published rows were trained and their checkpoints selected on.
         at: overrides of every row by scale.
+        folds: data set for cross-validation by scale, with choices NAME_fold0, NAME_fold1, ...: a
+            run of seed s has the fold s modulo their number, and so other test images than others.
+        blocks: by scale, neighbouring images that are drawn together for an interval
+            (`analysis.uncertainty.blocks`; default: auto).
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
@@ -192,6 +197,8 @@ class Table(Strict):
     lists: str = ""
     unit: str = "percent"
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    folds: Mapping[str, str] = field(default_factory=dict)
+    blocks: Mapping[str, NamedBlocks | Annotated[int, Interval(ge=1)]] = field(default_factory=dict)
     regions: str = "as trained"
     absent: Literal["released", "exclude"] | None = None
     columns: tuple[Column, ...]
@@ -219,6 +226,9 @@ class Table(Strict):
         for at in (self.at, *(row.at for row in self.rows), *released, *remarks):
             for scale in at or ():
                 check_choice("at", scale, available("scale"))
+        for scale, name in self.folds.items():
+            check_choice("folds", scale, available("scale"))
+            check_choice("folds", f"{name}_fold0", available("dataset"))
         if self.regions != "as trained":
             check_choice("regions", self.regions, available("metric"))
         self._check_columns()
@@ -305,8 +315,16 @@ class Table(Strict):
                 kept.append(column)
         return tuple(kept)
 
+    def of_fold(self, scale: str, seed: int) -> tuple[str, ...]:
+        """Return the override of the fold of a seed at a scale; () without folds."""
+        if scale not in self.folds:
+            return ()
+        name = self.folds[scale]
+        number = sum(choice.startswith(f"{name}_fold") for choice in available("dataset"))
+        return (f"dataset={name}_fold{seed % number}",)
+
     def overrides(self, row: Row, scale: str, form: Form = "paper") -> tuple[str, ...]:
-        """Return the overrides of a run that make the row, beside ``scale=...`` itself."""
+        """Return the overrides of a run that make the row, beside ``scale=...`` and its fold."""
         if row.experiment is None:
             raise InputError(f"row '{row.label}' has no experiment; it is shown as published only.")
         chosen = row.released if form == "released" and row.released else ReleasedForm()

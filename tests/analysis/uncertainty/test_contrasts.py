@@ -195,3 +195,32 @@ def test_what_cannot_be_compared_is_refused() -> None:
     for keys, counts in (({0: "a"}, row), ({FIXED: "a", 1: "b"}, {FIXED: row[0], 1: row[1]})):
         with pytest.raises(ValueError, match="expected counts and keys of one seed or more"):
             Term(weight=1.0, metric="mIoU", counts=counts, keys=keys)
+
+
+def test_folds_are_resampled_over_the_images_of_all_of_them() -> None:
+    """A seed tested on some images is one whose other counts are 0, whatever is drawn."""
+    rows = rows_of(images=24, seeds=3)
+    names = rows[0][0].names
+    folds = {0: names[:12], 1: names[12:], 2: names[6:18]}
+    parts = [{seed: row[seed].select(folds[seed]) for seed in row} for row in rows]
+    filled = []
+    for row in rows:
+        filled.append({})
+        for seed, counts in row.items():
+            used = np.array([name in folds[seed] for name in names])
+            zeroed = counts.counts * used[:, None, None, None]
+            filled[-1][seed] = replace(counts, counts=zeroed)
+    engine = Resampler(SETTINGS)
+    for metric in ("mIoU", "region/2"):
+        found = engine.contrast(difference(parts, metric))
+        expected, error = by_loop(difference(filled, metric), (0, 1, 2))
+        assert found.values == pytest.approx(expected.tolist())
+        assert found.error == pytest.approx(error * math.sqrt(24 / 23))
+        assert found.blocks == len(names)
+    # Two folds of other images with equal numbers do not share draws.
+    some = [{seed: row[seed] for seed in (0, 2)} for row in parts]
+    pair = Resampler(SETTINGS).contrast(difference(some))
+    assert engine.contrast(difference(some)).error == pytest.approx(pair.error)
+    parts[0][1] = rows[0][1].select(folds[0])
+    with pytest.raises(InputError, match="not of the same images"):
+        Resampler(SETTINGS).contrast(difference(parts))

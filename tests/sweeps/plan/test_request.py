@@ -220,3 +220,18 @@ def test_wrong_external_word_is_refused(tmp_path: Path, word: str) -> None:
     (tmp_path / "w").touch()
     with pytest.raises(InputError, match="row|ROW"):
         external_rows([word.format(folder=tmp_path)], NAMED)
+
+
+def test_seeds_are_folds_of_a_scale() -> None:
+    given = replace(load_table("crm/table3a"), folds={"real": "mfnet200"}, blocks={"real": 10})
+    request = TableRequest("crm/table3a", given, "real")
+    folds = [f"dataset=mfnet200_fold{number}" for number in range(4)]
+    words = [request.overrides("Ours", seed) for seed in (0, 1, 2, 3, 4, 13)]
+    assert [next(w for w in of if w.startswith("dataset=")) for of in words] == [
+        *folds,
+        folds[0],
+        folds[1],
+    ]
+    assert words[0][-1] == "seed=0"
+    plain = replace(request, scale="bench").overrides("Ours", 1)
+    assert not any(word.startswith("dataset=") for word in plain)
