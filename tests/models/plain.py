@@ -14,7 +14,7 @@ from rgbt.models.cmx.model import CMX
 from rgbt.models.critic import Critic
 from rgbt.models.deeplabv2 import DeepLabV2
 from rgbt.models.dinov2.model import DinoMask2Former
-from rgbt.models.efficientnet_lite import LiteMask2Former
+from rgbt.models.efficientnet_lite import LiteCMX, LiteMask2Former
 from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.models.mfnet import MFNet
@@ -65,11 +65,16 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "efficientnet_lite": (LiteMask2Former, {"num_classes": 4, "width": 0.2, "depth": 0.5,
                                             "norm_momentum": 0.1, "fusion": "max",
                                             "mask_token": "branch", **HEAD}),
+    "lite_cmx": (LiteCMX, {"num_classes": 4, "width": 0.2, "depth": 0.5, "norm_momentum": 0.1,
+                           "num_heads": (1, 1, 2, 2), "decoder_dim": 8, "decoder_dropout": 0.0}),
     "critic": (Critic, {"in_channels": 2, "base_width": 2, "upsample": False,
                         "align_corners": False}),
 }  # fmt: skip
 
-THREE_THERMAL = ("deeplabv2", "cmx", "cmnext", "semseg", "dinov2", "efficientnet_lite")
+THREE_THERMAL = (
+    *("deeplabv2", "cmx", "cmnext", "semseg", "dinov2"),
+    *("efficientnet_lite", "lite_cmx"),
+)
 """Networks whose thermal input has three channels."""
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
-from rgbt.models.efficientnet_lite import MAPS, STEM, EfficientNetLite, LiteBackbone, channels
+from rgbt.models.efficientnet_lite import MAPS, EfficientNetLite, LiteBackbone, channels
 from tests.models.plain import images, nano, normal, randomise
 
 
@@ -22,7 +24,7 @@ def test_features_are_those_of_the_package(size: int) -> None:
     theirs.eval()
     ours = EfficientNetLite(*multipliers(size), 0.1).eval()
     found = ours.load_state_dict(theirs.state_dict(), strict=False)
-    assert found.missing_keys == ["mask_token"]
+    assert found.missing_keys == []
     assert {name.split(".")[0] for name in found.unexpected_keys} == {"_conv_head", "_bn1", "_fc"}
     image = normal(2, 3, 64, 96)
     with torch.no_grad():
@@ -31,7 +33,10 @@ def test_features_are_those_of_the_package(size: int) -> None:
         for block in theirs._blocks:
             x = block(x)
             of_blocks.append(x)
-        maps = ours(image, None)
+        x, maps = ours.stem(image), []
+        for index in range(len(MAPS)):
+            x = ours.level(index, x)
+            maps.append(x)
     assert [level.shape[1:] for level in maps] == [
         (channels(multipliers(size)[0])[stage], 64 // stride, 96 // stride)
         for stage, stride in zip(MAPS, (4, 8, 16, 32), strict=True)
@@ -48,11 +53,11 @@ def test_sizes_are_those_of_the_release() -> None:
     with torch.device("meta"):
         blocks = [len(EfficientNetLite(*multipliers(size), 0.1)._blocks) for size in (0, 1, 2)]
     assert blocks == [16, 21, 21]
-    # 4,652,008 parameters of Lite0 less its classifier of 1280 channels; and a mask token.
+    # 4,652,008 parameters of Lite0 less its classifier of 1280 channels.
     with torch.device("meta"):
         encoder = EfficientNetLite(1.0, 1.0, 0.1)
     number = sum(weights.numel() for weights in encoder.parameters())
-    assert number == 4_652_008 - (320 * 1280 + 2 * 1280 + 1281 * 1000) + STEM
+    assert number == 4_652_008 - (320 * 1280 + 2 * 1280 + 1281 * 1000)
 
 
 def test_fixed_statistics_stay_in_training() -> None:
@@ -74,24 +79,54 @@ def test_fixed_statistics_stay_in_training() -> None:
 
 @torch.no_grad()
 def test_hidden_outputs_of_the_stem_are_the_token() -> None:
-    """With all hidden, the maps are those of an image that only its stem's token knows."""
-    encoder = nano("efficientnet_lite").eval().backbone.encoders["rgb"]
-    randomise(encoder)
+    backbone = nano("efficientnet_lite").eval().backbone
+    randomise(backbone)
     hidden = torch.ones(1, 32, 32, dtype=torch.bool)
-    first, second = (encoder(normal(1, 3, 64, 64, seed=seed), hidden) for seed in (0, 1))
+    seen = []
+    backbone.encoders["rgb"]._blocks[0].register_forward_hook(lambda _, x, __: seen.append(x[0]))
+    first, second = (
+        backbone.maps("rgb", normal(1, 3, 64, 64, seed=seed), hidden, None) for seed in (0, 1)
+    )
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
     hidden[:, :16] = False
     image = normal(1, 3, 64, 64)
-    seen = []
-    encoder._blocks[0].register_forward_hook(lambda _, given, __: seen.append(given[0]))
-    encoder(image, hidden)
-    encoder(image, None)
-    assert torch.equal(seen[0][:, :, :16], seen[1][:, :, :16])
-    assert torch.equal(seen[0][:, :, 16:], encoder.mask_token.expand(1, -1, 16, 32))
+    for mask in (hidden, None):
+        backbone.maps("rgb", image, mask, None)
+    *_, masked, whole = seen
+    assert torch.equal(masked[:, :, :16], whole[:, :, :16])
+    token = backbone.mask_tokens["rgb"].expand(1, -1, 16, 32)
+    assert torch.equal(masked[:, :, 16:], token)
 
 
 def test_branches_share_a_token_on_request() -> None:
     for kind in ("branch", "shared"):
-        backbone = LiteBackbone(0.2, 0.5, None, fusion="max", mask_token=kind)
-        tokens = [backbone.encoders[name].mask_token for name in ("rgb", "thermal")]
-        assert (tokens[0] is tokens[1]) == (kind == "shared")
+        tokens = LiteBackbone(0.2, 0.5, None, fusion="max", mask_token=kind).mask_tokens
+        assert (tokens["rgb"] is tokens["thermal"]) == (kind == "shared")
+
+
+@torch.no_grad()
+def test_streams_of_cmx_continue_with_what_the_rectification_returns() -> None:
+    """Without it, thermal reaches RGB's second map; a stream alone would not change."""
+    net = nano("lite_cmx").eval()
+    randomise(net)
+    seen: list[torch.Tensor] = []
+    encoder = net.backbone["encoders"]["rgb"]
+    later = encoder._blocks[encoder.last[MAPS[0]] + 1]
+    later.register_forward_hook(lambda _, x, __: seen.append(x[0]))
+    rgb, thermal = images(1)
+    net(rgb, thermal)
+    net(rgb, 1 - thermal)
+    first = encoder.stem(net.inputs(rgb, thermal, multiple=32).rgb)
+    rectified = net.backbone["FRMs"][0]
+    assert not torch.equal(seen[0], seen[1])
+    streams = [
+        net.backbone["encoders"][name].level(0, x)
+        for name, x in (("rgb", first), ("thermal", thermal_stem(net, rgb, thermal)))
+    ]
+    expected, _ = rectified(*(x.permute(0, 2, 3, 1) for x in streams))
+    assert torch.allclose(seen[0], expected.permute(0, 3, 1, 2))
+
+
+def thermal_stem(net: Any, rgb: torch.Tensor, thermal: torch.Tensor) -> torch.Tensor:
+    shown = net.inputs(rgb, thermal, multiple=32).thermal
+    return net.backbone["encoders"]["thermal"].stem(shown.expand(-1, 3, -1, -1))
