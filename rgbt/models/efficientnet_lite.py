@@ -76,7 +76,7 @@ def pad_same(x: Tensor, kernel: int, stride: int) -> Tensor:
     return F.pad(x, (before, total - before) * 2)
 
 
-class Block(nn.Module):
+class InvertedResidual(nn.Module):
     """Expands, convolves depthwise and projects: (N, c, h, w) -> (N, C, h / stride, w / stride).
 
     Source: MobileNetV2 (Sandler et al., CVPR 2018), Sec. 3.4, with batch normalisation and ReLU6.
@@ -131,7 +131,7 @@ class EfficientNetLite(nn.Module):
             is_end = index in (0, len(STAGES) - 1)
             for number in range(repeats if is_end else math.ceil(depth * repeats)):
                 step = stride if number == 0 else 1
-                self._blocks.append(Block(inputs, outputs, kernel, step, expansion))
+                self._blocks.append(InvertedResidual(inputs, outputs, kernel, step, expansion))
                 inputs = outputs
             self.last.append(len(self._blocks) - 1)
         for module in self.modules():
