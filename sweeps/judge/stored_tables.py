@@ -49,18 +49,27 @@ def runs_of_request(
     runs: dict[RowSeed, Outcome] = {}
     errors = []
     for row in request.trained_rows:
-        experiment = request.overrides(row.label, 0)[0]
-        seeds = reader.seeds(experiment.removeprefix("+experiment="), request.scale)
         try:
-            for seed in seeds or ([0] if checked else []):
-                words = request.overrides(row.label, seed)
-                run = reader.find(planner.specify((*planner.base, *words), checked=checked))
-                if run is not None:
-                    runs[row.label, seed] = _finished(row.label, run)
+            runs |= _runs_of_row(request, row.label, reader, planner, checked=checked)
         except InputError as error:
             errors.append(error)
     if errors and len(errors) == len(request.trained_rows):
         raise errors[0]  # the command is wrong, and not a row
+    return runs
+
+
+def _runs_of_row(
+    request: TableRequest, label: str, reader: RunReader, planner: Planner, *, checked: bool
+) -> dict[RowSeed, Outcome]:
+    """Find the finished runs of a row; a fold of the images is composed for each seed."""
+    experiment = request.overrides(label, 0)[0].removeprefix("+experiment=")
+    seeds = reader.seeds(experiment, request.scale)
+    runs = {}
+    for seed in seeds or ([0] if checked else []):
+        words = (*planner.base, *request.overrides(label, seed))
+        run = reader.find(planner.specify(words, checked=checked))
+        if run is not None:
+            runs[label, seed] = _finished(label, run)
     return runs
 
 

@@ -53,6 +53,29 @@ def test_imagenet_swin_is_loaded_into_both_branches(tmp_path: Path) -> None:
             assert torch.equal(after[key], before[key]), key
 
 
+@pytest.mark.parametrize("yaml", ["mask2former_lite0", "cmx_lite0"])
+def test_imagenet_efficientnet_fills_both_encoders(tmp_path: Path, yaml: str) -> None:
+    """The file has no prefix; its head is not used, and has a normalisation called _bn1."""
+    model = network(yaml, width=0.2, depth=0.5, **({"num_heads": [1] * 4} if "cmx" in yaml else {}))
+    beginning = "backbone.encoders.rgb."
+    names = [name for name in model.state_dict() if name.startswith(beginning)]
+    file = OrderedDict(
+        (name.removeprefix(beginning), like({name.removeprefix(beginning): value}).popitem()[1])
+        for name, value in model.state_dict().items()
+        if name in names
+    )
+    head = {"_conv_head.weight": (1280, 64, 1, 1), "_bn1.weight": (1280,), "_fc.bias": (1000,)}
+    plan = load_weights(model, saved(tmp_path, file | named(head)))
+    assert plan.kind.title == "ImageNet EfficientNet-Lite"
+    assert plan.convention == ("model/inputs=lite",)
+    assert set(plan.unused) == set(head)
+    for modality in ("rgb", "thermal"):
+        for name in file:
+            found = model.state_dict()[f"backbone.encoders.{modality}.{name}"]
+            assert name.endswith("num_batches_tracked") or holds(found, name), name
+    assert not any(name.startswith("backbone.encoders.") for name in plan.fresh)
+
+
 def timm_swin() -> Tensors:
     """timm has the merging between two stages in the second of them, and head.fc."""
 
