@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,11 +40,15 @@ CONTRASTS = [
 CONTRASTS += ["explored_high", "explored_seeds", "confirmed", "confirmed_low", "confirmed_high"]
 CONTRASTS += ["confirmed_seeds"]
 
+PAIRS = ["first", "second", "alike", "contrasts", "low", "high", "rho", "rho_low", "rho_high"]
+PRINT = "print"
+
 SIGNS = ["images", "scale", "alike", "contrasts", "low", "high", "decided_alike", "decided"]
 
 # Rows below which a rank correlation says nothing.
 FEWEST_ROWS = 3
 DRAWS = 4_000
+RHO_DRAWS = 1_000
 
 
 def ranks_of(tables: Sequence[JudgedTable]) -> pd.DataFrame:
@@ -177,9 +182,7 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     found = []
     for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
         ours = ours_of(group)
-        is_confirmed = group["confirmed"].notna()
-        low = group["confirmed_low"].where(is_confirmed, group["explored_low"])
-        high = group["confirmed_high"].where(is_confirmed, group["explored_high"])
+        low, high = ends_of(group)
         known = ours.notna() & (group["printed"] != 0)
         alike = known & (ours * group["printed"] > 0)
         decided = known & ((low > 0) | (high < 0))
@@ -190,6 +193,64 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
         of_decided = ((alike & decided).sum(), decided.sum())
         found.append((images, scale, alike.sum(), known.sum(), *ends, *of_decided))
     return pd.DataFrame(found, columns=SIGNS)
+
+
+def kinds_of(contrasts: pd.DataFrame) -> pd.Series:
+    """Return on what each contrast was measured, such as "synthetic scenes, scale=bench"."""
+    return contrasts["images"] + ", scale=" + contrasts["scale"]
+
+
+def ends_of(contrasts: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return the ends of the interval of `ours_of`; NaN without one."""
+    is_confirmed = contrasts["confirmed"].notna()
+    low = contrasts["confirmed_low"].where(is_confirmed, contrasts["explored_low"])
+    return low, contrasts["confirmed_high"].where(is_confirmed, contrasts["explored_high"])
+
+
+def pairs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
+    """Compare print and every kind of runs with each other, over the contrasts that both have.
+
+    Returns:
+        the columns `PAIRS`, a row for each pair of `PRINT` and `kinds_of`: alike of so many
+        contrasts have the same sign; rho is Spearman's correlation of the differences; low, high,
+        rho_low and rho_high are ends of 95 % intervals, with whole tables drawn anew (NaN for one
+        table).
+    """
+    import pandas as pd
+
+    frame = contrasts.assign(ours=ours_of(contrasts), kind=kinds_of(contrasts))
+    place = ["table", "claim", "contrast"]
+    wide = frame.pivot_table(index=place, columns="kind", values="ours", aggfunc="first")
+    wide.insert(0, PRINT, frame.groupby(place)["printed"].first())
+    found = []
+    for first, second in combinations(wide.columns, 2):
+        both = wide[[first, second]].dropna()
+        both = both[(both != 0).all(axis=1)]
+        if len(both) < FEWEST_ROWS:
+            continue
+        tables = both.index.get_level_values("table")
+        parts = [part.to_numpy() for _, part in both.groupby(tables)]
+        alike = [int((part[:, 0] * part[:, 1] > 0).sum()) for part in parts]
+        ends = _share_interval(np.array(alike), np.array([len(part) for part in parts]))
+        every = (sum(alike), len(both), *ends, *_rho_interval(parts))
+        found.append((first, second, *every))
+    return pd.DataFrame(found, columns=PAIRS)
+
+
+def _rho_interval(parts: Sequence[Values]) -> tuple[float, float, float]:
+    """Spearman's correlation of the columns of parts (n, 2), and its ends with parts redrawn."""
+    (rho,) = _rho(parts)
+    if len(parts) < 2:
+        return rho, math.nan, math.nan
+    places = numpy_generator(0, "pairs").integers(0, len(parts), (RHO_DRAWS, len(parts)))
+    drawn = [_rho([parts[place] for place in row])[0] for row in places]
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return rho, float(low), float(high)
+
+
+def _rho(parts: Sequence[Values]) -> Values:
+    both = np.concatenate(parts)
+    return rank_correlations(both[None, :, 0], both[:, 1])
 
 
 def ours_of(contrasts: pd.DataFrame) -> pd.Series:

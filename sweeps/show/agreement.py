@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable
-from sweeps.judge.agreement import ours_of
+from sweeps.judge.agreement import PRINT, ends_of, kinds_of, ours_of
 from sweeps.show.figure import OURS, PUBLISHED
 
 if TYPE_CHECKING:
@@ -82,6 +82,50 @@ def signs_grid(contrasts: pd.DataFrame) -> TextTable:
         rows.append((str(table), f"{images}, scale={scale}", alike, confirmed))
     header = ("table", "on", "sign as printed", "by declared seeds")
     return TextTable("", header, tuple(rows))
+
+
+def pairs_grid(pairs: pd.DataFrame) -> TextTable:
+    """Show how far print and each kind of runs agree (`sweeps.judge.agreement.pairs_of`)."""
+    rows = []
+    for _, row in pairs.iterrows():
+        share, rho = f"{100 * row['alike'] / row['contrasts']:.0f} %", f"{row['rho']:+.2f}"
+        if not math.isnan(row["low"]):
+            share += f" [{100 * row['low']:.0f}, {100 * row['high']:.0f}]"
+            rho += f" [{row['rho_low']:+.2f}, {row['rho_high']:+.2f}]"
+        counted = f"{row['alike']} of {row['contrasts']}"
+        rows.append((f"{row['first']} and {row['second']}", counted, share, rho))
+    header = ("compared", "same sign", "share [95 %]", "Spearman [95 %]")
+    return TextTable("", header, tuple(rows))
+
+
+def sides_grid(contrasts: pd.DataFrame, beside: str) -> TextTable:
+    """Show each contrast in print and in every kind of runs, if runs on `beside` have it.
+
+    `beside` is the beginning of a kind (`sweeps.judge.agreement.kinds_of`). A star says that the
+    interval excludes 0, "declared" that the seeds were declared.
+    """
+    low, high = ends_of(contrasts)
+    frame = contrasts.assign(
+        ours=ours_of(contrasts), kind=kinds_of(contrasts), low=low, high=high
+    ).dropna(subset=["ours"])
+    kinds = sorted(frame["kind"].unique(), key=lambda kind: (kind.startswith(beside), kind))
+    rows = []
+    for (table, _, contrast), own in frame.groupby(["table", "claim", "contrast"], sort=False):
+        if not own["kind"].str.startswith(beside).any():
+            continue
+        by_kind = {row["kind"]: _side(row) for _, row in own.iterrows()}
+        printed = f"{own['printed'].iloc[0]:+.2f}"
+        cells = [by_kind.get(kind, ABSENT) for kind in kinds]
+        rows.append((f"{table}: {contrast}", printed, *cells))
+    return TextTable("", ("contrast", PRINT, *kinds), tuple(rows))
+
+
+def _side(row: pd.Series) -> str:
+    if math.isnan(row["low"]):
+        return f"{row['ours']:+.2f}"
+    star = "*" if row["low"] > 0 or row["high"] < 0 else ""
+    declared = "" if math.isnan(row["confirmed"]) else ", declared"
+    return f"{row['ours']:+.2f}{star} [{row['low']:+.2f}, {row['high']:+.2f}]{declared}"
 
 
 def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:

@@ -20,12 +20,19 @@ from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
-from sweeps.judge.agreement import contrasts_frame, ranks_of, signs_of
+from sweeps.judge.agreement import contrasts_frame, pairs_of, ranks_of, signs_of
 from sweeps.judge.judged_claim import NOT_RUN
 from sweeps.judge.stored_tables import judged_tables, known_tables
 from sweeps.plan.planner import Planner
-from sweeps.score.reader import SYNTHETIC, RunReader
-from sweeps.show.agreement import agreement_lines, ranks_grid, signs_grid, signs_in_words
+from sweeps.score.reader import REAL, SYNTHETIC, RunReader
+from sweeps.show.agreement import (
+    agreement_lines,
+    pairs_grid,
+    ranks_grid,
+    sides_grid,
+    signs_grid,
+    signs_in_words,
+)
 from sweeps.show.claims import chance_of, counts_grid, statement
 from sweeps.show.sections import (
     STUDIES,
@@ -42,7 +49,7 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).with_name("templates")
 # Scales in the order in which their verdicts count more.
-SCALES = ("smoke", "demo", "bench", "paper")
+SCALES = ("smoke", "demo", "bench", "real", "paper")
 
 # A path from the root of a machine; addresses of pages and relative paths do not match.
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
@@ -158,6 +165,7 @@ class Report:
                 of_papers.append(table)
             elif not table.is_run and table.page != STUDIES:
                 own.append(table)
+        sides = sides_grid(self.contrasts, REAL)
         data = {
             **self.data,
             "num_runs": len(self.runs),
@@ -169,6 +177,8 @@ class Report:
             "agreement": self.agreement,
             "signs": markdown(signs_grid(self.contrasts)),
             "ranks": markdown(ranks_grid(self.ranks)),
+            "sides": markdown(sides) if sides.rows else "",
+            "pairs": markdown(pairs_grid(pairs_of(self.contrasts))),
             "own": own,
             "papers_tables": of_papers,
             "studies": self.studies.items(),
@@ -188,6 +198,7 @@ class Report:
             "index",
             "claims",
             "agreement",
+            "real-images",
             "networks",
             *(paper["name"] for paper in self.papers),
         ]

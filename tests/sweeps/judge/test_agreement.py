@@ -5,13 +5,29 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from sweeps.judge.agreement import SIGNS, contrasts_frame, rank_correlations, ranks_of, signs_of
+from sweeps.judge.agreement import (
+    CONTRASTS,
+    SIGNS,
+    contrasts_frame,
+    pairs_of,
+    rank_correlations,
+    ranks_of,
+    signs_of,
+)
 from sweeps.judge.judged_table import JudgedTable
 from sweeps.plan.claim import Claim
 from sweeps.plan.table import Column, Row
-from sweeps.show.agreement import agreement_lines, forest_of, ranks_grid, signs_grid
+from sweeps.show.agreement import (
+    agreement_lines,
+    forest_of,
+    pairs_grid,
+    ranks_grid,
+    sides_grid,
+    signs_grid,
+)
 from tests.sweeps.judge.accuracies import judged, planted
 from tests.sweeps.tabled import table
 
@@ -112,3 +128,39 @@ def test_agreement_is_shown_and_drawn() -> None:
     assert names[0] == "one: b - c, mIoU", "the sign that differs from print is on top"
     assert len(names) == 3
     assert forest_of(contrasts.iloc[:0], "P") is None
+
+
+def measured(kind: str, scale: str, ours: dict[str, float]) -> pd.DataFrame:
+    """Contrasts a to d of two tables, printed as 1, 2, -3 and 4, with ends one point away."""
+    printed = {"a": 1.0, "b": 2.0, "c": -3.0, "d": 4.0}
+    rows = []
+    for name, value in ours.items():
+        row = dict.fromkeys(CONTRASTS, math.nan) | {"paper": "p", "images": kind, "scale": scale}
+        row |= {"table": "one" if name in "ab" else "two", "claim": name, "contrast": name}
+        row |= {"printed": printed[name], "explored": value, "explored_low": value - 1}
+        rows.append(row | {"explored_high": value + 1, "decides": True})
+    return pd.DataFrame(rows)
+
+
+def test_print_bench_and_real_images_are_compared_in_pairs() -> None:
+    """Bench has all four, real images three; each pair is over what both have."""
+    bench = measured("synthetic scenes", "bench", {"a": 1.0, "b": -2.0, "c": -3.0, "d": 0.5})
+    real = measured("real images of m", "real", {"a": 5.0, "b": -7.0, "d": 6.0})
+    both = pd.concat([bench, real], ignore_index=True)
+    found = {(row["first"], row["second"]): row for row in pairs_of(both).to_dict("records")}
+    synthetic, images = "synthetic scenes, scale=bench", "real images of m, scale=real"
+    counts = {pair: (row["alike"], row["contrasts"]) for pair, row in found.items()}
+    assert counts == {
+        ("print", images): (2, 3),
+        ("print", synthetic): (3, 4),
+        (images, synthetic): (3, 3),
+    }
+    # Ranks of print 2 3 1 4 and bench 4 2 1 3 differ by 2, 1, 0, 1: 1 - 6 * 6 / (4 * 15).
+    assert found["print", synthetic]["rho"] == pytest.approx(0.4)
+    row = found[images, synthetic]
+    assert row["rho"] == pytest.approx(0.5), "ranks 2 1 3 and 3 1 2"
+    assert row["low"] <= 1.0 <= row["high"]
+    assert "| 3 of 3 | 100 % [" in pairs_grid(pairs_of(both)).to_markdown()
+    text = sides_grid(both, "real images").to_markdown()
+    assert "| one: a | +1.00 | +1.00 [+0.00, +2.00] | +5.00* [+4.00, +6.00] |" in text
+    assert "two: c" not in text, "it was not run on real images"
