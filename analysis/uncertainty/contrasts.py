@@ -17,7 +17,7 @@ import numpy as np
 
 from analysis.uncertainty.blocks import FEWEST, ImageBlocks, Resampling, Values, make_blocks
 from analysis.uncertainty.intervals import Spread, over_images, over_seeds
-from analysis.uncertainty.same_images import Alike, in_order
+from analysis.uncertainty.same_images import Alike, check_same_kind, in_order
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, convention
@@ -192,12 +192,17 @@ class Resampler:
         Of a seed, the images are those of the reference, or of its first seed where it has none.
         """
         firsts = [seed for seed in seeds if seed in reference.counts] or sorted(reference.counts)
+        first = reference.counts[firsts[0]]
         found = {}
         for seed in seeds if seeds and not term.fixed else sorted(term.counts):
             key = term.keys[seed]
-            like = seed if seed in reference.counts else firsts[0]
+            # Folds have other images; of others, all seeds are compared with the first.
+            own = reference.counts.get(seed, first)
+            is_fold = own.names != first.names and set(own.names) != set(first.names)
+            like = seed if is_fold else firsts[0]
             name = reference.keys[like]
             if (name, key) not in self._compared:
+                check_same_kind(first, term.counts[seed], self._alike)
                 same = in_order(reference.counts[like], term.counts[seed], self._alike)
                 names = tuple(sorted(same.names))
                 self._ordered[key] = same if same.names == names else same.select(names)

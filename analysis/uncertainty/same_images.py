@@ -24,17 +24,7 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
     Raises:
         InputError: other images, classes, scored classes, labels or regions.
     """
-    if other.classes != first.classes:
-        raise InputError(
-            f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
-            f"{', '.join(other.classes)}; score both on one data set."
-        )
-    check_same_means(first, other)
-    if alike != "labels" and other.partition != first.partition:
-        raise InputError(
-            f"counts by {first.partition} cannot be compared with counts by {other.partition}: "
-            "the regions, or the second frames of pairs, differ. Measure both in the same way."
-        )
+    check_same_kind(first, other, alike)
     only = sorted(set(first.names) ^ set(other.names))
     if only:
         raise InputError(
@@ -48,6 +38,21 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
     if alike != "names":
         _check_labels(first, same)
     return same
+
+
+def check_same_kind(first: Counts, other: Counts, alike: Alike) -> None:
+    """Refuse counts of other classes, scored classes or, unless `alike` is "labels", regions."""
+    if other.classes != first.classes:
+        raise InputError(
+            f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
+            f"{', '.join(other.classes)}; score both on one data set."
+        )
+    check_same_means(first, other)
+    if alike != "labels" and other.partition != first.partition:
+        raise InputError(
+            f"counts by {first.partition} cannot be compared with counts by {other.partition}: "
+            "the regions, or the second frames of pairs, differ. Measure both in the same way."
+        )
 
 
 def _check_labels(first: Counts, same: Counts) -> None:

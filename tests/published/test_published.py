@@ -39,6 +39,8 @@ NOT_OF_A_RECIPE = {
     "optimizer/sgd_thesis_tiny transform/thesis_96x192 transform/thesis_blur_96x192 "
     "transform/heatnet_96x192 transform/semseg_89x89",
     "starts of scale=bench": "experiment/start",
+    "scale=real, whose networks and lists are ours": "scale/real dataset/mfnet200 dataset/crack332 "
+    "model/mask2former_lite model/cmx_lite model/inputs/lite",
     "networks of other authors": "model/external model/inputs/dformer model/inputs/imagenet_449 "
     "model/inputs/unit_three",
     "data sets and losses that no paper here uses": "dataset/fmb dataset/semanticrt dataset/msrs "

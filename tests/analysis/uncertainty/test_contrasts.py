@@ -223,6 +223,9 @@ def test_folds_are_resampled_over_the_images_of_all_of_them() -> None:
         alone = Resampler(SETTINGS).contrast(some)
         assert engine.contrast(some).error == pytest.approx(alone.error)
         assert alone.blocks == 18
+    other = [{**row, 1: replace(row[1], unscored=("person",))} for row in parts]
+    with pytest.raises(InputError, match="mean"):
+        Resampler(SETTINGS).contrast(difference(other))
     parts[0][1] = rows[0][1].select(folds[0])
     with pytest.raises(InputError, match="not of the same images"):
         Resampler(SETTINGS).contrast(difference(parts))
