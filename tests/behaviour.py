@@ -47,8 +47,12 @@ TEN_STEPS = [
 NAMING = ("vendor_id", "cpu family", "model", "stepping", "CPU implementer", "CPU part")
 MEASURED = ("images_per_s", "wait_share", "peak_memory_mib", "seconds_left")
 COUNTED = ("absent", "classes", "counts", "dataset", "names", "partition", "split")
-REL_TOL, ABS_TOL = 1e-4, 1e-6
-"""Of first losses on another kind of machine; later ones differ by up to 4%."""
+FIRST = (1e-4, 1e-6)
+"""Relative and absolute tolerance of first losses on another kind of machine; later ones differ by
+up to 4%."""
+
+UPSTREAM = (0.1, 0.01)
+"""Likewise of experiments whose first loss follows ten steps of an upstream run."""
 
 
 def record(runs_dir: Path) -> dict[str, Any]:
@@ -128,18 +132,32 @@ def written(value: Any, depth: int = 4) -> str:
     return "{\n" + ",\n".join(entries) + "\n}"
 
 
-def differences(old: dict[str, Any], new: dict[str, Any], is_exact: bool) -> Iterator[str]:
+def tolerance(experiment: str) -> tuple[float, float]:
+    """`FIRST` or `UPSTREAM`."""
+    from tests.composed import specified
+
+    return UPSTREAM if specified((f"+experiment={experiment}",)).upstream else FIRST
+
+
+def differences(
+    old: dict[str, Any],
+    new: dict[str, Any],
+    is_exact: bool,
+    first_within: tuple[float, float] = FIRST,
+) -> Iterator[str]:
     """What differs between two results of `training`.
 
     Args:
         is_exact: False compares the first value of every loss with a tolerance, and no counts.
+        first_within: see `tolerance`.
     """
     for part in sorted(old["steps"].keys() | new["steps"].keys()):
         one, other = (each["steps"].get(part, []) for each in (old, new))
         is_same = one == other
         if not is_exact and len(one) == len(other):
             first = float.fromhex(one[0]), float.fromhex(other[0])
-            is_close = math.isclose(*first, rel_tol=REL_TOL, abs_tol=ABS_TOL)
+            rel_tol, abs_tol = first_within
+            is_close = math.isclose(*first, rel_tol=rel_tol, abs_tol=abs_tol)
             is_same = is_close or not part.startswith("loss")
         if not is_same:
             yield f"{part}: {one} became {other}"
@@ -153,12 +171,15 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> int:
     """Print one line per experiment; the number of experiments that differ."""
     is_exact = old["machine"] == new["machine"]
     if not is_exact:
-        print(f"Another kind of machine: first losses are compared within {REL_TOL:g}, no counts.")
+        print(
+            f"Another kind of machine: first losses are compared within {FIRST[0]:g} "
+            f"({UPSTREAM[0]:g} behind an upstream run), no counts."
+        )
     differing = 0
     nothing: dict[str, Any] = {"steps": {}, "counts": {}}
     for name in sorted(old["experiments"].keys() | new["experiments"].keys()):
         pair = (each["experiments"].get(name, nothing) for each in (old, new))
-        found = list(differences(*pair, is_exact))
+        found = list(differences(*pair, is_exact, tolerance(name)))
         print(f"{name:38} {'; '.join(found[:3]) or 'same'}")
         differing += bool(found)
     return differing

@@ -357,6 +357,7 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
             "index",
             "claims",
             "agreement",
+            "real-images",
             "networks",
             "studies",
             "my",
