@@ -39,7 +39,7 @@ def weights_page() -> str:
                     start.trained_on,
                     start.origin,
                     ", ".join(map(code, start.models)),
-                    code(start.digest) or "not stated",
+                    code(start.digest[:8]) or "not stated",
                 ]
                 for start in STARTS
             ],

@@ -29,7 +29,7 @@ from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code
-from rgbt.runs.starts import IMAGENET, packaged
+from rgbt.runs.starts import IMAGENET, packaged, packaged_start
 
 if TYPE_CHECKING:
     from rgbt.runs.result import RunResult
@@ -403,6 +403,8 @@ class RunSpec:
         dependency = self.dependency(key)
         if dependency is not None:
             return f"{dependency.run.key}/{dependency.checkpoint}"
+        if key == WEIGHTS and value == IMAGENET:
+            return packaged_start(self.plain["model"]).digest  # also where it is not installed
         if key == WEIGHTS:
             path = self.weights_path
             assert path is not None, "model.weights has a value"

