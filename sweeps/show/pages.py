@@ -102,7 +102,7 @@ class Report:
             self.studies[path.parent.name] = path.read_text(errors="replace")
 
     def _decisive_claims(self) -> pd.DataFrame:
-        """Every claim once: judged at the largest scale, by the declared seeds, or the most seeds."""
+        """Every claim once: judged, at the largest scale, by declared seeds, or by the most."""
         ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
         is_sure = self.every["basis"] == "confirmation"
         is_judged = self.every["verdict"] != NOT_RUN
