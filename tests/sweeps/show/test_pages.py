@@ -13,7 +13,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import pandas as pd
 import pytest
 import yaml
 
@@ -393,3 +396,24 @@ def test_report_needs_no_torch(place: Path, tmp_path: Path) -> None:
     )
     assert done.stdout.strip().endswith("0 set()"), done.stderr
     assert (tmp_path / "index.html").is_file()
+
+
+def test_a_claim_is_shown_where_it_is_judged_best() -> None:
+    """Judged comes before the scale, the scale before declared seeds, these before their number."""
+
+    def claim(verdict: str, scale: str, basis: str, seeds: int) -> dict[str, object]:
+        known = {"verdict": verdict, "scale": scale, "basis": basis, "seeds": seeds}
+        return {"table": "p/t", "claim": "c", **known}
+
+    bench = claim("not shown", "bench", "exploration", 6)
+    declared = claim("same direction", "bench", "confirmation", 4)
+    real = claim("same direction", "real", "exploration", 1)
+    empty = claim("not run", "real", "", 0)
+    for every, expected in (
+        ([declared, empty], declared),
+        ([declared, bench], declared),
+        ([real, declared, empty], real),
+    ):
+        of_report = SimpleNamespace(every=pd.DataFrame(every))
+        found = Report._decisive_claims(cast("Report", of_report))
+        assert found[list(expected)].to_dict("records") == [expected]
