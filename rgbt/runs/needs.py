@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.run_spec import RunSpec
@@ -100,7 +102,9 @@ def _checkpoint_bytes(run: RunSpec, is_averaged: bool) -> int:
     run.use(("model", "loss", "masker", "scheme", "optimizer", "domains"))
     with torch.device("meta"):
         network = run.model.build()
-    built = run.build("masker", "loss", "optimizer", class_pixels=lambda: None)
+    # Computed class weights have a size alone here; no label is read for it.
+    ones = np.ones((1, network.num_classes), np.int64)
+    built = run.build("masker", "loss", "optimizer", class_pixels=lambda: ones)
     # A feature distance has no parameters, but wants the classes of a data set that may be missing.
     values = {key: value for key, value in run.scheme.values.items() if key != "feature_distance"}
     parts = {"model": network, "loss": built["loss"], "masker": built["masker"]}

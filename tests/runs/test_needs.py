@@ -44,6 +44,15 @@ def test_bytes_of_the_network_of_crm() -> None:
     assert size == pytest.approx(4 * 4 * 117.56e6, rel=1e-3)
 
 
+@pytest.mark.parametrize("weights", ["enet", "median_frequency", "inverse"])
+def test_computed_class_weights_do_not_change_the_bytes(weights: str) -> None:
+    sizes = []
+    for words in ((), (f"loss.class_weights={weights}",)):
+        sizes.append(checkpoint_bytes(specify_run(("+experiment=cmx", *words), checked=False)))
+    assert sizes[0] == sizes[1]
+    assert sizes[0] > 0
+
+
 def test_the_size_of_a_network_of_another_author_is_not_known() -> None:
     run = specify_run(("+experiment=mfnet", "model=external/dformer_l"), checked=False)
     assert checkpoint_bytes(run) is None
