@@ -202,7 +202,8 @@ class Resampler:
             like = seed if is_fold else firsts[0]
             name = reference.keys[like]
             if (name, key) not in self._compared:
-                check_same_kind(first, term.counts[seed], self._alike)
+                if is_fold:
+                    check_same_kind(first, term.counts[seed], self._alike)
                 same = in_order(reference.counts[like], term.counts[seed], self._alike)
                 names = tuple(sorted(same.names))
                 self._ordered[key] = same if same.names == names else same.select(names)

@@ -165,7 +165,7 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
     axes.set_yticks(places, [_name_of(row) for _, row in frame.iterrows()], fontsize=7)
     axes.set_xlabel("difference in percent points (Var: squared); linear between -1 and 1")
     axes.grid(axis="x", alpha=0.25)
-    kinds = sorted({f"{row['images']}, scale={row['scale']}" for _, row in frame.iterrows()})
+    kinds = sorted(set(kinds_of(frame)))
     figure.suptitle(f"{title}: printed differences and ours ({'; '.join(kinds)})", fontsize=10)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return figure

@@ -166,7 +166,6 @@ class Report:
                 of_papers.append(table)
             elif not table.is_run and table.page != STUDIES:
                 own.append(table)
-        sides = sides_grid(self.contrasts, REAL)
         data = {
             **self.data,
             "num_runs": len(self.runs),
@@ -178,13 +177,15 @@ class Report:
             "agreement": self.agreement,
             "signs": markdown(signs_grid(self.contrasts)),
             "ranks": markdown(ranks_grid(self.ranks)),
-            "sides": markdown(sides) if sides.rows else "",
-            "pairs": markdown(pairs_grid(pairs_of(self.contrasts))),
             "own": own,
             "papers_tables": of_papers,
             "studies": self.studies.items(),
             "any_verdict": bool((self.claims["verdict"] != NOT_RUN).any()),
         }
+        if name == "real-images":  # draws tables anew, which no other page needs
+            sides = sides_grid(self.contrasts, REAL)
+            data["sides"] = markdown(sides) if sides.rows else ""
+            data["pairs"] = markdown(pairs_grid(pairs_of(self.contrasts)))
         if name == "networks":
             data |= networks_section(self.texts["networks"])
         papers = {paper["name"]: paper for paper in self.papers}
