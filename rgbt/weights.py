@@ -42,7 +42,7 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
 
     from rgbt.checkpoints.files import read
     from rgbt.checkpoints.load import plan_for, recognised
-    from rgbt.runs.run_spec import file_digest
+    from rgbt.files.plain_files import file_digest
     from rgbt.runs.starts import start_lines
     from rgbt.terminal import path_lines, print_rich
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -59,6 +60,12 @@ def read_bytes(path: Path) -> bytes:
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is not a regular file.")
     return path.read_bytes()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def disguise(path: Path) -> str:

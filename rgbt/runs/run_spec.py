@@ -25,7 +25,7 @@ from rgbt.data.loader_settings import LOADING, LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import MACHINE_SETTINGS, Recipe, Scale, TrainerSettings
 from rgbt.files.atomic import is_held
-from rgbt.files.plain_files import read_json
+from rgbt.files.plain_files import file_digest, read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code
@@ -433,12 +433,6 @@ def settings_digest(plain: Mapping[str, Any]) -> str:
         node, _, key = path.partition(".")
         settings[node].pop(key, None)
     return _digest({**settings, "seed": plain.get("seed")})
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _settings_in_key(plain: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

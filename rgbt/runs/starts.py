@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -15,6 +14,7 @@ from pydantic import TypeAdapter
 
 from rgbt.checks import InputError
 from rgbt.config.compose import load_choice
+from rgbt.files.plain_files import file_digest
 from rgbt.files.yaml_files import read_yaml
 
 # Settings of a network that decide which file fits it.
@@ -111,7 +111,7 @@ def packaged(model: Mapping[str, Any]) -> Path:
     for folder in (spec.submodule_search_locations or ()) if spec else ():
         path = Path(folder, "models", start.file)
         if path.is_file():
-            found = hashlib.sha256(path.read_bytes()).hexdigest()
+            found = file_digest(path)
             if found != start.digest:
                 raise InputError(
                     f"model.weights={IMAGENET}: {path} is not the published file; its SHA-256 "
