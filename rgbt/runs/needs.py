@@ -102,8 +102,8 @@ def _checkpoint_bytes(run: RunSpec, is_averaged: bool) -> int:
     run.use(("model", "loss", "masker", "scheme", "optimizer", "domains"))
     with torch.device("meta"):
         network = run.model.build()
-    # Computed class weights have a size alone here; no label is read for it.
-    ones = np.ones((1, network.num_classes), np.int64)
+    # No checkpoint holds class weights, so that no label is read to compute them.
+    ones = np.ones((1, 255), np.int64)
     built = run.build("masker", "loss", "optimizer", class_pixels=lambda: ones)
     # A feature distance has no parameters, but wants the classes of a data set that may be missing.
     values = {key: value for key, value in run.scheme.values.items() if key != "feature_distance"}

@@ -6,7 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from torch import nn
 
+from rgbt.requirements import NetworkRecord
 from rgbt.runs.needs import MEMORY, checkpoint_bytes, free_bytes, in_gb, lacking, step_gb
 from sweeps.plan.planner import specify_run
 from tests.benchmarks import bench_memory
@@ -51,6 +53,33 @@ def test_computed_class_weights_do_not_change_the_bytes(weights: str) -> None:
         sizes.append(checkpoint_bytes(specify_run(("+experiment=cmx", *words), checked=False)))
     assert sizes[0] == sizes[1]
     assert sizes[0] > 0
+
+
+class OneLayer(nn.Module):
+    """A user's network: it states what NetworkRecord asks for and has no further attribute."""
+
+    record = NetworkRecord(views=("rgbt",))
+
+    def __init__(self, *, num_classes: int, inputs: nn.Module) -> None:
+        super().__init__()
+        self.classify = nn.Conv2d(4, num_classes, 1, bias=False)
+
+
+@pytest.mark.parametrize("weights", ["null", "enet"])
+def test_bytes_of_a_network_that_has_only_its_record(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "model").mkdir()
+    text = f"""
+defaults: [inputs: unit, _self_]
+_target_: {__name__}.OneLayer
+num_classes: 7
+"""
+    (tmp_path / "model" / "one_layer.yaml").write_text(text)
+    monkeypatch.setenv("RGBT_CONF", str(tmp_path))
+    words = ("+experiment=mfnet", "model=one_layer", f"loss.class_weights={weights}")
+    run = specify_run((*words, "optimizer=adamw"), checked=False)
+    assert checkpoint_bytes(run) == 2 * 4 * 28 + 2 * 4 * 28  # last and best; two moments
 
 
 def test_the_size_of_a_network_of_another_author_is_not_known() -> None:
