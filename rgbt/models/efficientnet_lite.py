@@ -52,6 +52,7 @@ RELEASED_MOMENTUM = 0.01
 
 Multiplier = Annotated[float, Interval(ge=0.1, le=10)]
 Momentum = Annotated[float, Interval(gt=0, le=1)]
+FrozenStages = Annotated[int, Interval(ge=0, le=len(STAGES))]
 
 
 def channels(width: float) -> list[int]:
@@ -115,10 +116,13 @@ class EfficientNetLite(nn.Module):
     `efficientnet-lite-pytorch`, whose network has a head that is not used here.
 
     `norm_momentum` is the share of a batch in the running statistics; None: the statistics stay
-    those of the file, in training too.
+    those of the file, in training too. The stem and the first `frozen_stages` stages keep weights
+    and statistics of the file; 0: all are trained, the stem too.
     """
 
-    def __init__(self, width: float, depth: float, norm_momentum: float | None) -> None:
+    def __init__(
+        self, width: float, depth: float, norm_momentum: float | None, frozen_stages: int
+    ) -> None:
         super().__init__()
         self.is_fixed = norm_momentum is None
         self._conv_stem = nn.Conv2d(3, STEM, 3, stride=2, bias=False)
@@ -139,12 +143,21 @@ class EfficientNetLite(nn.Module):
                 module.momentum = norm_momentum or RELEASED_MOMENTUM
             elif isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out")
+        self.frozen_stages = frozen_stages
+        for part in self._frozen():
+            part.requires_grad_(False)
+
+    def _frozen(self) -> list[nn.Module]:
+        if self.frozen_stages == 0:
+            return []
+        end = self.last[self.frozen_stages - 1] + 1
+        return [self._conv_stem, self._bn0, *self._blocks[:end]]
 
     def train(self, mode: bool = True) -> EfficientNetLite:
         """Set training mode; fixed statistics are used as in evaluation."""
         super().train(mode)
-        if self.is_fixed:
-            for module in self.modules():
+        for part in [self] if self.is_fixed else self._frozen():
+            for module in part.modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.train(False)
         return self
@@ -161,11 +174,13 @@ class EfficientNetLite(nn.Module):
         return x
 
 
-def encoders(width: float, depth: float, norm_momentum: float | None) -> nn.ModuleDict:
+def encoders(
+    width: float, depth: float, norm_momentum: float | None, frozen_stages: int
+) -> nn.ModuleDict:
     """Make an encoder of each modality; the arguments are those of `EfficientNetLite`."""
     made = nn.ModuleDict()
     for modality in MODALITIES:
-        made[modality] = EfficientNetLite(width, depth, norm_momentum)
+        made[modality] = EfficientNetLite(width, depth, norm_momentum, frozen_stages)
     return made
 
 
@@ -183,12 +198,13 @@ class LiteBackbone(nn.Module):
         width: float,
         depth: float,
         norm_momentum: float | None,
+        frozen_stages: int,
         *,
         fusion: FusionKind,
         mask_token: str,
     ) -> None:
         super().__init__()
-        self.encoders = encoders(width, depth, norm_momentum)
+        self.encoders = encoders(width, depth, norm_momentum, frozen_stages)
         tokens = []
         for _ in MODALITIES:
             tokens.append(nn.Parameter(torch.empty(1, STEM, 1, 1)))
@@ -238,6 +254,7 @@ class LiteMask2Former(MaskNetwork):
         width: Multiplier,
         depth: Multiplier,
         norm_momentum: Momentum | None,
+        frozen_stages: FrozenStages,
         fusion: FusionKind,
         mask_token: Literal["branch", "shared"],
         hidden_dim: HiddenDim,
@@ -250,7 +267,8 @@ class LiteMask2Former(MaskNetwork):
         pixel_decoder_fp32: bool,
         inputs: Inputs,
     ) -> None:
-        backbone = LiteBackbone(width, depth, norm_momentum, fusion=fusion, mask_token=mask_token)
+        size = (width, depth, norm_momentum, frozen_stages)
+        backbone = LiteBackbone(*size, fusion=fusion, mask_token=mask_token)
         head = HeadShape(
             num_classes=num_classes,
             hidden_dim=hidden_dim,
@@ -288,6 +306,7 @@ class LiteCMX(Network):
         width: Multiplier,
         depth: Multiplier,
         norm_momentum: Momentum | None,
+        frozen_stages: FrozenStages,
         num_heads: Widths,
         decoder_dim: Channels,
         decoder_dropout: ShareBelowOne,
@@ -304,7 +323,7 @@ class LiteCMX(Network):
             StreamFusion(size, heads) for size, heads in zip(widths, num_heads, strict=True)
         )
         meeting.apply(initialise)
-        meeting["encoders"] = encoders(width, depth, norm_momentum)
+        meeting["encoders"] = encoders(width, depth, norm_momentum, frozen_stages)
         self.backbone = meeting
         eps = (NORM_EPS, NORM_EPS)
         self.decode_head = MlpDecoder(

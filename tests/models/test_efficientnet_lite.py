@@ -22,7 +22,7 @@ def test_features_are_those_of_the_package(size: int) -> None:
     theirs = package.EfficientNet.from_name(f"efficientnet-lite{size}", image_size=None)
     randomise(theirs)
     theirs.eval()
-    ours = EfficientNetLite(*multipliers(size), 0.1).eval()
+    ours = EfficientNetLite(*multipliers(size), 0.1, 0).eval()
     found = ours.load_state_dict(theirs.state_dict(), strict=False)
     assert found.missing_keys == []
     assert {name.split(".")[0] for name in found.unexpected_keys} == {"_conv_head", "_bn1", "_fc"}
@@ -51,11 +51,11 @@ def test_sizes_are_those_of_the_release() -> None:
     assert channels(1.0) == [16, 24, 40, 80, 112, 192, 320]
     assert channels(1.1) == [16, 24, 48, 88, 120, 208, 352]
     with torch.device("meta"):
-        blocks = [len(EfficientNetLite(*multipliers(size), 0.1)._blocks) for size in (0, 1, 2)]
+        blocks = [len(EfficientNetLite(*multipliers(size), 0.1, 0)._blocks) for size in (0, 1, 2)]
     assert blocks == [16, 21, 21]
     # 4,652,008 parameters of Lite0 less its classifier of 1280 channels.
     with torch.device("meta"):
-        encoder = EfficientNetLite(1.0, 1.0, 0.1)
+        encoder = EfficientNetLite(1.0, 1.0, 0.1, 0)
     number = sum(weights.numel() for weights in encoder.parameters())
     assert number == 4_652_008 - (320 * 1280 + 2 * 1280 + 1281 * 1000)
 
@@ -75,6 +75,23 @@ def test_fixed_statistics_stay_in_training() -> None:
             assert torch.allclose(mean, expected, atol=1e-5)
     net = nano("efficientnet_lite", norm_momentum=None).train()
     assert net.backbone.norm_layers["res2"].training, "the fusion has statistics of its own"
+
+
+@pytest.mark.parametrize("stages", [0, 1, 3, 7])
+def test_frozen_stages_keep_weights_and_statistics(stages: int) -> None:
+    encoder = EfficientNetLite(0.2, 0.5, 0.1, stages).train()
+    end = encoder.last[stages - 1] + 1 if stages else 0
+    frozen = {"_conv_stem", "_bn0", *(f"_blocks.{n}" for n in range(end))} if stages else set()
+    before = {name: value.clone() for name, value in encoder.state_dict().items()}
+    x = encoder.stem(normal(2, 3, 64, 64))
+    for index in range(4):
+        x = encoder.level(index, x)
+    if stages < 7:
+        x.sum().backward()
+        torch.optim.SGD(encoder.parameters(), 1.0).step()
+    changed = {name for name, x in encoder.state_dict().items() if not torch.equal(x, before[name])}
+    of_frozen = {name for name in before if name.startswith(tuple(f"{part}." for part in frozen))}
+    assert changed == before.keys() - of_frozen
 
 
 @torch.no_grad()
@@ -100,7 +117,7 @@ def test_hidden_outputs_of_the_stem_are_the_token() -> None:
 
 def test_branches_share_a_token_on_request() -> None:
     for kind in ("branch", "shared"):
-        tokens = LiteBackbone(0.2, 0.5, None, fusion="max", mask_token=kind).mask_tokens
+        tokens = LiteBackbone(0.2, 0.5, None, 0, fusion="max", mask_token=kind).mask_tokens
         assert (tokens["rgb"] is tokens["thermal"]) == (kind == "shared")
 
 
