@@ -136,6 +136,7 @@ def thermal_table(dataset: FileDataset, report: DatasetReport) -> TextTable:
     and the height of its own largest bin.
     """
     unit = dataset.images.unit
+    form = "{:.5g}" if unit is None else "{:.1f}"
     found: dict[str, NDArray[np.float64]] = {}
     for split, report_of in report.splits.items():
         for time, points in report_of.thermal.items():
@@ -151,10 +152,10 @@ def thermal_table(dataset: FileDataset, report: DatasetReport) -> TextTable:
         counts = np.histogram(points.clip(*ends), BINS, tuple(ends))[0]
         heights = np.ceil(counts / counts.max() * (len(BLOCKS) - 1)).astype(int)
         bars = "".join(BLOCKS[height] for height in heights)
-        rows.append((name, *(f"{value:.5g}" for value in values), bars))
+        rows.append((name, *(form.format(value) for value in values), bars))
     share = f"{TAIL:.1%}", "median", f"{1 - TAIL:.1%}"
     what = "thermal values" if unit is None else "thermal in °C"
-    histogram = f"{ends[0]:.5g} to {ends[1]:.5g}"
+    histogram = " to ".join(map(form.format, ends))
     return TextTable("", (what, "lowest", *share, "highest", histogram), tuple(rows))
 
 
@@ -179,7 +180,11 @@ def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
 def check_dataset(
     dataset: FileDataset, *, num_threads: int = 4, is_shown: bool = False
 ) -> DatasetReport:
-    """Read every sample of the splits, in threads, and report problems; progress goes to stderr."""
+    """Read every sample of the splits, in threads, and report problems; progress goes to stderr.
+
+    InputError: `auto` finds no thermal range.
+    """
+    dataset.settle_range(None)  # once, before threads need it
     lists: dict[str, tuple[str, ...]] = {}
     problems: Sentences = []
     notes: Sentences = []

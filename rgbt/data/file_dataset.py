@@ -148,8 +148,10 @@ class FileDataset:
                 images[name] = kind_of(values), points_of(values)
         if not images:
             raise InputError(f"dataset.thermal_range=auto: {errors[0]}")
-        for name, text in mixed(images, self.images.unit):
-            raise InputError(f"dataset.thermal_range=auto: '{name}': {text}")
+        unlike = mixed(images, self.images.unit)
+        if unlike:
+            what = f"{len(unlike)} of {len(images)} training images, first '{unlike[0][0]}'"
+            raise InputError(f"dataset.thermal_range=auto: {what}: {unlike[0][1]}")
         return found_range(np.stack([points for _, points in images.values()]), self.images.unit)
 
     def listed(self, split: str) -> tuple[str, ...]:

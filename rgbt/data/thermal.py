@@ -22,13 +22,13 @@ from PIL.ExifTags import Base
 from rgbt.checks import InputError, one_line
 from rgbt.data.files import LEFT_OUT, UNREADABLE, decode, read_array, read_bytes
 from rgbt.files.atomic import write_atomic
+from rgbt.ranges import Text
 
 Level = Annotated[float, Interval(ge=-1e6, le=1e6)]
 Range = tuple[Level, Level]
-UnitName = Literal["celsius", "kelvin", "centikelvin"]
 Auto = Literal["auto"]
 # [low, high] or auto, in stored values; or a mapping of `unit` and `range`, in degrees Celsius.
-ThermalRange = Range | Auto | dict[Literal["unit", "range"], UnitName | Auto | Range]
+ThermalRange = Range | Text | dict[Text, Text | Range]
 
 # `auto`: what of the values is darker than black, and as much brighter than white; and of how many
 # training images, which are enough for percentiles and take a few seconds.
@@ -76,17 +76,19 @@ def unit_and_limits(setting: ThermalRange | None) -> tuple[Unit | None, Range | 
     unit: Unit | None = None
     limits: Any = setting
     if isinstance(setting, Mapping):
-        given, limits = setting.get("unit"), setting.get("range")
-        if isinstance(given, tuple) and given[0] > 0:
-            unit = Unit("", *given)
-        elif given in UNITS:
-            unit = UNITS[str(given)]
-        if unit is None or limits is None or limits in UNITS:
-            raise InputError(
-                "dataset.thermal_range: expected {unit: U, range: R}, where U is "
-                f"{', '.join(UNITS)} or [gain, offset] with a gain above 0, and R is [low, high] "
-                f"in degrees Celsius or auto; got {dict(setting)}."
-            )
+        given: Any = setting.get("unit")
+        limits = setting.get("range")
+        is_own = isinstance(given, tuple) and given[0] > 0
+        unit = Unit("", *given) if is_own else UNITS.get(given)
+    is_known = isinstance(limits, tuple) or limits == "auto"
+    if isinstance(setting, Mapping) and not (unit and is_known and len(setting) == 2):
+        raise InputError(
+            "dataset.thermal_range: expected {unit: U, range: R}, where U is "
+            f"{', '.join(UNITS)} or [gain, offset] with a gain above 0, and R is [low, high] "
+            f"in degrees Celsius or auto; got {dict(setting)}."
+        )
+    if not is_known and limits is not None:
+        raise InputError(f"dataset.thermal_range: expected [low, high] or auto, got {limits}.")
     if isinstance(limits, tuple) and not limits[0] < limits[1]:
         raise InputError(
             f"dataset.thermal_range: expected [low, high], got {list(limits)}: the thermal "

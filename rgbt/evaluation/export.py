@@ -109,7 +109,7 @@ def export(
         image_hw=size,
         dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.
-        settings={**_with_range(session), "tracking": {"_target_": NO_TRACKING}},
+        settings={**with_range(session), "tracking": {"_target_": NO_TRACKING}},
     )
     content = onnx_bytes(graph, description)
     network = ExportedNetwork(content, out)
@@ -137,7 +137,7 @@ def export(
     return description, comparison, {hw: len(names) for hw, names in by_size.items()}
 
 
-def _with_range(session: Session) -> dict[str, Any]:
+def with_range(session: Session) -> dict[str, Any]:
     """Return the settings of a session, with what `auto` of the thermal range found."""
     plain, dataset = dict(session.spec.plain), dict(session.spec.plain["dataset"])
     if session.thermal_range is not None:

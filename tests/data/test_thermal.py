@@ -29,7 +29,7 @@ R1, B, F, OFFSET, R2 = 16556.0, 1428.0, 1.0, -342, 0.045
 
 
 def raw_of(celsius: np.ndarray) -> np.ndarray:
-    """The counts of FLIR's cameras: R1 / (R2 (exp(B / T) - F)) - OFFSET, without air and reflection."""
+    """The counts of FLIR's cameras without air: R1 / (R2 (exp(B / T) - F)) - OFFSET."""
     kelvin = celsius + 273.15
     return np.round(R1 / (R2 * (np.exp(B / kelvin) - F)) - OFFSET).astype("<u2")
 
@@ -223,7 +223,7 @@ def test_mixed_files_are_named(tmp_path: Path) -> None:
     units = own(tmp_path / "a", {**files, "train_2.tif": kelvin}, AUTO)
     text = "thermal values look like kelvin, expected celsius; store values in one unit."
     assert refused(lambda: units.read("val_1")) == (
-        f"dataset.thermal_range=auto: 'train_2': {text}"
+        f"dataset.thermal_range=auto: 1 of 2 training images, first 'train_2': {text}"
     )
     for setting in ({**AUTO, "range": (0.0, 40.0)}, (0.0, 40.0)):
         units = own(tmp_path / "a", {**files, "train_2.tif": kelvin}, setting)
@@ -275,7 +275,7 @@ def test_histogram_by_day_and_night(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "setting",
-    [{"unit": "celsius"}, {"range": "auto"}, {"unit": "auto", "range": "auto"}]
+    [{"unit": "celsius"}, {"range": "auto"}, {"unit": "fahrenheit", "range": "auto"}]
     + [{"unit": (0.0, 1.0), "range": "auto"}, {"unit": "celsius", "range": "kelvin"}],
 )
 def test_wrong_units_are_refused(setting: Any) -> None:
@@ -285,6 +285,7 @@ def test_wrong_units_are_refused(setting: Any) -> None:
 
 
 def test_range_has_to_rise() -> None:
+    assert "expected [low, high] or auto, got wide" in refused(lambda: unit_and_limits("wide"))
     said = refused(lambda: unit_and_limits({"unit": "celsius", "range": (5.0, 5.0)}))
     assert "expected [low, high], got [5.0, 5.0]" in said
     assert math.isclose(UNITS["centikelvin"].degrees(29315), 20)
