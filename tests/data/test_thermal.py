@@ -190,7 +190,7 @@ def test_radiometric_files_are_recognised(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_photo_and_temperature_of_flir(tmp_path: Path) -> None:
-    """The photo has its own size; a file may lack it, and no embedded program is started."""
+    """The photo has its own size; a file may lack it. One in another format is not opened."""
     source, out = tmp_path / "source", tmp_path / "out"
     source.mkdir()
     (source / "one.jpg").write_bytes(flir(photo=jpeg((20, 14))))
@@ -208,7 +208,9 @@ def test_photo_and_temperature_of_flir(tmp_path: Path) -> None:
     assert np.asarray(Image.open(out / "rgb/one.png")).shape == (14, 20, 3)
     assert "no" in refused(lambda: unpack_flir(source, out))
     harmful = tmp_path / "harmful.jpg"
-    harmful.write_bytes(flir(photo=b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"))
+    bitmap = io.BytesIO()
+    Image.new("RGB", (20, 14)).save(bitmap, "BMP")  # as any other: EPS would start a program
+    harmful.write_bytes(flir(photo=bitmap.getvalue()))
     assert f"{harmful}: its measurement cannot be read" in refused(lambda: read_flir(harmful))
     exif = Image.Exif()
     exif[0x0112] = 6
