@@ -38,7 +38,7 @@ Sentences = list[tuple[str, str]]
 # In sentences of one kind: values, which are kept, and paths and other numbers, which are not.
 VARYING = re.compile(r"((?:label|thermal) value -?[\d.e+-]+|colour \[[^]]*\])|\S*/\S*|\d+")
 # Bins of a histogram, and their heights.
-BINS, BLOCKS = 24, " ▁▂▃▄▅▆▇█"
+BINS, HEIGHTS = 24, " .:-=+*#@"
 OF_FILE = re.compile(r"'([^']+)'|(\S*/\S+)")
 
 
@@ -150,11 +150,11 @@ def thermal_table(dataset: FileDataset, report: DatasetReport) -> TextTable:
     for name, points in found.items():
         values = [points.min(), *np.quantile(points, (TAIL, 0.5, 1 - TAIL)), points.max()]
         counts = np.histogram(points.clip(*ends), BINS, tuple(ends))[0]
-        heights = np.ceil(counts / counts.max() * (len(BLOCKS) - 1)).astype(int)
-        bars = "".join(BLOCKS[height] for height in heights)
+        heights = np.ceil(counts / counts.max() * (len(HEIGHTS) - 1)).astype(int)
+        bars = "".join(HEIGHTS[height] for height in heights)
         rows.append((name, *(form.format(value) for value in values), bars))
     share = f"{TAIL:.1%}", "median", f"{1 - TAIL:.1%}"
-    what = "thermal values" if unit is None else "thermal in °C"
+    what = "thermal values" if unit is None else "thermal, Celsius"
     histogram = " to ".join(map(form.format, ends))
     return TextTable("", (what, "lowest", *share, "highest", histogram), tuple(rows))
 
@@ -164,9 +164,9 @@ def range_line(images: PairReader) -> str:
     if images.chosen_range is None:
         return "thermal: grey levels of 8 bits, used as they are."
     low, high = images.chosen_range
-    of_unit = "" if images.unit is None else " °C"
+    of_unit = "" if images.unit is None else " degrees Celsius"
     by = "" if images.find_range is None else ", found by auto in images of the split train"
-    return f"thermal: {low:g}{of_unit} becomes black, {high:g}{of_unit} white{by}."
+    return f"thermal: {low:g} becomes black, {high:g}{of_unit} white{by}."
 
 
 def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:

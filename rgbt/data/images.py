@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.data.files import read_packed, read_rgb
 from rgbt.data.patterns import Patterns
-from rgbt.data.thermal import Range, Unit, maker_of, read_thermal
+from rgbt.data.thermal import Range, Unit, check_unit, maker_of, read_thermal
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
@@ -130,14 +130,10 @@ class PairReader:
                 f"{path}: expected {wanted} of shape (rows, columns), got {values.dtype} of shape "
                 f"{values.shape}; {self.advice}."
             )
-        if self.unit is not None and self.unit.name and values.dtype == np.uint8:
-            raise InputError(
-                f"{path}: expected {self.unit.name}, got 8 bits, which hold grey levels; use the "
-                "original file."
-            )
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             wrong = np.count_nonzero(~np.isfinite(values))
             raise InputError(f"{path}: {wrong} thermal values are NaN or infinite; replace them.")
+        check_unit(values, self.unit, path)
         if values.ndim == 2:
             return values
         # Whole channels are compared: comparing their interleaved pixels takes five times as long.

@@ -35,8 +35,7 @@ ThermalRange = Range | Text | dict[Text, Text | Range]
 TAIL, MOST_IMAGES = 0.005, 200
 # Values of an image that stand for all, from the smallest to the largest, equally spaced by rank.
 POINTS = 201
-# Degrees Celsius between which the median of an image of a scene lies: values of another unit are
-# outside.
+# Degrees Celsius between which the median of an image of a scene lies; in another unit it does not.
 PLAUSIBLE = (-90.0, 200.0)
 
 # Beginning of an APP4 segment of DJI's R-JPEG, and of the APP1 segments of FLIR.
@@ -235,44 +234,51 @@ def found_range(points: NDArray[np.float64], unit: Unit | None) -> Range:
 def mixed(
     images: Mapping[str, tuple[str, NDArray[np.float64]]], unit: Unit | None
 ) -> list[tuple[str, str]]:
-    """Find images whose values have another type, or look like another unit, than others.
+    """Find images whose values have another type, or look like another unit, than most.
 
-    Real numbers, and values with a named unit, are judged by their median (`PLAUSIBLE`).
+    Units are those of real numbers without a setting; with one, each file was compared with it.
 
     Args:
         images: name -> type of the stored values (`kind_of`), and `points_of` them.
-        unit: of the setting; the unit of most images where there is none.
+        unit: of the setting.
 
     Returns:
         names, each with a sentence.
     """
-    if not images:
-        return []
-    usual = Counter(kind for kind, _ in images.values()).most_common(1)[0][0]
-    others = {name: kind for name, (kind, _) in images.items() if kind != usual}
-    if others:
+    looks = {name: kind for name, (kind, _) in images.items()}
+    if len(set(looks.values())) > 1:
         text = "thermal is {}, of most images {}; store values of one type."
-        return [(name, text.format(kind, usual)) for name, kind in others.items()]
-    is_named = unit is not None and unit.name != ""
-    if not is_named and (unit is not None or usual != "float"):
+    elif unit is None and "float" in looks.values():
+        looks = {name: likely_unit(points) for name, (_, points) in images.items()}
+        text = "thermal values look like {}, of most images {}; store values in one unit."
+    known = Counter(filter(None, looks.values())).most_common()
+    if len(known) < 2:
         return []
-    likely = {
-        name: _likely_unit(points, unit)
-        for name, (_, points) in images.items()
-        if points[0] < points[-1]
-    }
-    counted = Counter(filter(None, likely.values())).most_common(1)
-    wanted = unit.name if unit is not None else counted[0][0] if counted else ""
-    text = "thermal values look like {}, expected {}; store values in one unit."
-    return [
-        (n, text.format(found, wanted)) for n, found in likely.items() if found not in ("", wanted)
-    ]
+    usual = known[0][0]
+    return [(n, text.format(look, usual)) for n, look in looks.items() if look not in ("", usual)]
 
 
-def _likely_unit(points: NDArray[np.float64], unit: Unit | None) -> str:
-    """Return the first unit in which the median is plausible, that of the setting before others."""
-    median = points[POINTS // 2]
+def check_unit(values: NDArray[Any], unit: Unit | None, path: Path) -> None:
+    """Refuse grey levels of 8 bits, and values that look like another unit than a named one."""
+    if unit is None or not unit.name:
+        return
+    found = "grey levels of 8 bits"
+    if values.dtype != np.uint8:  # some pixels are enough for a median
+        found = likely_unit(values[::4, ::4], unit)
+    if found not in ("", unit.name):
+        raise InputError(
+            f"{path}: expected {unit.name}, but its values look like {found}; store one unit, or "
+            "set that of dataset.thermal_range."
+        )
+
+
+def likely_unit(values: NDArray[Any], unit: Unit | None = None) -> str:
+    """Return the first unit in which the median is plausible, `unit` before others; "": none.
+
+    "" also for an image of one value, which shows nothing.
+    """
+    median = np.median(values)
     for known in (*([] if unit is None else [unit]), *UNITS.values()):
         if PLAUSIBLE[0] < known.degrees(median) < PLAUSIBLE[1]:
-            return known.name
+            return known.name if values.min() < values.max() else ""
     return ""

@@ -130,7 +130,7 @@ def test_degrees_of_each_kind_of_file(kind: str, tmp_path: Path) -> None:
     assert dataset.read("val_1").thermal.max() == 255
     report = check_dataset(dataset)
     assert report.problems == ()
-    assert f"{low:g} °C becomes black, {high:g} °C white, found by auto" in range_line(
+    assert f"{low:g} becomes black, {high:g} degrees Celsius white, found by auto" in range_line(
         dataset.images
     )
     rows = {row[0]: row for row in thermal_table(dataset, report).rows}
@@ -219,18 +219,22 @@ def test_photo_and_temperature_of_flir(tmp_path: Path) -> None:
 
 
 def test_mixed_files_are_named(tmp_path: Path) -> None:
-    """Of two types, of two units, and 8 bits beside degrees: by check, and by auto."""
+    """Of two types, of two units, and 8 bits beside degrees: when read, by check, and by auto."""
     celsius, kelvin = CELSIUS.astype(np.float32), (CELSIUS + 273.15).astype(np.float32)
     files = split_files(lambda _: celsius, ".tif")
-    units = own(tmp_path / "a", {**files, "train_2.tif": kelvin}, AUTO)
-    text = "thermal values look like kelvin, expected celsius; store values in one unit."
-    assert refused(lambda: units.read("val_1")) == (
-        f"dataset.thermal_range=auto: 1 of 2 training images, first 'train_2': {text}"
-    )
-    for setting in ({**AUTO, "range": (0.0, 40.0)}, (0.0, 40.0)):
-        units = own(tmp_path / "a", {**files, "train_2.tif": kelvin}, setting)
-        assert f"train_2: {text}" in check_dataset(units).problems
-    free = own(tmp_path / "a", files, {"unit": (1.0, 0.0), "range": (0.0, 400.0)})
+    two = {**files, "train_2.tif": kelvin}
+    degrees = own(tmp_path / "a", two, AUTO)
+    (found,) = check_dataset(degrees).problems
+    path = tmp_path / "a" / "train" / "ir" / "2.tif"
+    assert found.startswith(f"train_2: {path}: expected celsius, but its values look like kelvin")
+    assert degrees.images.chosen_range[1] < 35  # without the kelvins
+    stored = own(tmp_path / "a", two, "auto")
+    text = "thermal values look like kelvin, of most images celsius; store values in one unit."
+    said = refused(lambda: stored.read("val_1"))
+    assert said == f"dataset.thermal_range=auto: 1 of 2 training images, first 'train_2': {text}"
+    fixed = own(tmp_path / "a", two, (0.0, 400.0))
+    assert check_dataset(fixed).problems == (f"train_2: {text}",)
+    free = own(tmp_path / "a", two, {"unit": (1.0, 0.0), "range": (0.0, 400.0)})
     assert check_dataset(free).problems == ()  # an own unit is not judged
     counts = (CELSIUS * 100).astype(np.uint16)
     types = own(tmp_path / "b", {**files, "val_1.tif": counts}, (0.0, 40.0))
@@ -238,11 +242,12 @@ def test_mixed_files_are_named(tmp_path: Path) -> None:
     assert text in check_dataset(types).problems
     grey = own(tmp_path / "c", {**files, "val_1.tif": CELSIUS.astype(np.uint8)}, AUTO)
     (found,) = check_dataset(grey).problems
-    assert found.startswith(f"val_1: {tmp_path}/c/val/ir/1.tif: expected celsius, got 8 bits")
-    sixteen = own(tmp_path / "d", {**files, "val_1.tif": counts, "test_1.tif": counts}, None)
-    assert sum(
-        "expected thermal values of 8 bits" in text for text in check_dataset(sixteen).problems
-    )
+    assert found.startswith(f"val_1: {tmp_path}/c/val/ir/1.tif: expected celsius")
+    assert "grey levels of 8 bits" in found
+    levels = split_files(lambda _: CELSIUS.astype(np.uint8), ".tif")
+    sixteen = own(tmp_path / "d", {**levels, "val_1.tif": counts}, None)
+    (found,) = check_dataset(sixteen).problems
+    assert f"{tmp_path}/d/val/ir/1.tif: expected thermal values of 8 bits" in found
 
 
 def test_median_decides_the_unit() -> None:
@@ -269,7 +274,7 @@ def test_histogram_by_day_and_night(tmp_path: Path) -> None:
     table = thermal_table(dataset, check_dataset(dataset))
     assert [row[0] for row in table.rows[:3]] == ["train", "train day", "train night"]
     whole, day, night = (row[-1] for row in table.rows[:3])
-    assert table.header[0] == "thermal in °C"
+    assert table.header[0] == "thermal, Celsius"
     assert not day[:11].strip()
     assert not night[13:].strip()
     assert " " not in day[13:] + night[:11] + whole[:11] + whole[13:]
