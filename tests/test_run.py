@@ -27,6 +27,7 @@ from rgbt.data.file_dataset import FileDataset
 from rgbt.dataset import reader_of
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.evaluation.export import with_range
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
 from rgbt.runs.specify import specify
@@ -451,6 +452,8 @@ def test_run_keeps_the_thermal_range_it_found(call: Call, tmp_path: Path) -> Non
     again = set_up_training(specify(compose([*words, "fresh=true"]))).session.thermal_range
     assert again is not None
     assert again[0] == expected[0] + 3000
-    (run / "dataset.json").unlink()
-    with pytest.raises(InputError, match="has no thermal_range of the run"):
-        open_run(run, [])
+    for damaged in ({**marker, "thermal_range": [9, 9]}, {**marker, "thermal_range": [9, 1]}):
+        del damaged["crc32"]
+        write_json(run / "dataset.json", damaged)
+        with pytest.raises(InputError, match="has no thermal_range of the run"):
+            open_run(run, [])

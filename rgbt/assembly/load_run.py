@@ -211,9 +211,10 @@ def _found_range(
     limits = trained.get("range") if isinstance(trained, Mapping) else trained
     if limits != "auto" or isinstance(trained, Mapping) != isinstance(now, Mapping):
         return None
-    if marker is None or "thermal_range" not in marker:
+    low, high = (0.0, 0.0) if marker is None else marker.get("thermal_range", (0.0, 0.0))
+    if not low < high:
         raise InputError(f"{folder / 'dataset.json'} has no thermal_range of the run; {ADVICE}.")
-    return marker["thermal_range"]
+    return low, high
 
 
 def _changed(
