@@ -17,12 +17,20 @@ import pytest
 import torch
 
 from rgbt import evaluate, predict
+from rgbt.assembly.load_run import open_run
+from rgbt.assembly.training_setup import set_up_training
 from rgbt.checkpoints.files import save
+from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
+from rgbt.data.file_dataset import FileDataset
+from rgbt.dataset import reader_of
 from rgbt.engine.checkpoint import load_checkpoint
+from rgbt.evaluation.export import with_range
+from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
+from rgbt.runs.specify import specify
 from tests.checkpoints.test_torch_files import same
 from tests.commands import (
     DAYS_AND_NIGHTS,
@@ -43,6 +51,8 @@ from tests.composed import specified
 from tests.conftest import write_png
 from tests.data.layouts import (
     PATTERNS,
+    folder,
+    write_any,
     write_folder,
     write_freiburg,
     write_kp,
@@ -406,3 +416,44 @@ def test_chain_without_validation_split_reports_its_last_checkpoints(
         assert (result["best_step"], result["steps"]) == (2, 2)
         assert not {"val", "best_score"} & set(result)
         assert {line["kind"] for line in logged(path.parent)} == {"train", "test"}
+
+
+@pytest.mark.usefixtures("pictures")
+def test_run_keeps_the_thermal_range_it_found(call: Call, tmp_path: Path) -> None:
+    """Evaluated, predicted, exported and resumed with it, though the training images change."""
+    root = write_folder(tmp_path / "data")
+    data = ("dataset=folder", f"dataset.root={root}", f"runs_dir={tmp_path / 'runs'}", *OWN)
+    words = ("+experiment=grbm", "+debug=smoke", "masker.patch_size=32", *data, *ON_CPU)
+    words = (*words, "dataset.thermal_range=auto")
+    expected = folder(root, thermal_range="auto").images.chosen_range
+    code, _, err = call(main, *words)
+    assert code == 0, err
+    run = only_run(tmp_path / "runs")
+    marker = json.loads((run / "dataset.json").read_text())
+    assert tuple(marker["thermal_range"]) == expected
+    for path in root.glob("train/ir/*.tif"):
+        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        write_any(path, counts + np.uint16(3000))
+    opened = open_run(run, [])
+    reader = reader_of(opened.dataset)
+    assert isinstance(reader, FileDataset)
+    assert reader.images.limits == expected
+    assert opened.changed == ()
+    assert with_range(opened)["dataset"]["thermal_range"] == list(expected)
+    typed = open_run(run, ["dataset.thermal_range=[20000,24000]"])
+    assert (typed.thermal_range, typed.dataset.decoding()["thermal_range"]) == (None, (2e4, 24e3))
+    # Degrees are no counts: those of the data set are found anew.
+    degrees = "dataset.thermal_range={unit: centikelvin, range: auto}"
+    (low, high) = open_run(run, [degrees]).thermal_range or (0, 0)
+    assert -273.15 + 230 <= low < high <= -273.15 + 270
+    spec = specify(compose(list(words)))
+    assert spec.folder.name == run.name
+    assert set_up_training(spec).session.thermal_range == expected
+    again = set_up_training(specify(compose([*words, "fresh=true"]))).session.thermal_range
+    assert again is not None
+    assert again[0] == expected[0] + 3000
+    for damaged in ({**marker, "thermal_range": [9, 9]}, {**marker, "thermal_range": [9, 1]}):
+        del damaged["crc32"]
+        write_json(run / "dataset.json", damaged)
+        with pytest.raises(InputError, match="has no thermal_range of the run"):
+            open_run(run, [])

@@ -26,12 +26,13 @@ from rgbt.config.stored_config import (
     read_settings,
     settings_of,
 )
+from rgbt.data.thermal import Range
 from rgbt.engine.checkpoint import check_origin, load_checkpoint, restore_weights, step_of
 from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import dataset_words
-from rgbt.runs.folder import find_run, read_marker, read_provenance, run_key
+from rgbt.runs.folder import ADVICE, Marker, find_run, read_marker, read_provenance, run_key
 from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.source_code import code_of
 from rgbt.runs.specify import CHECKOUT, load_spec, specify
@@ -184,9 +185,10 @@ def with_weights(
     check_links(folder)
     payload = load_checkpoint(weights)
     check_origin(payload, weights, run_key(folder), settings_digest(trained_with))
-    session = open_session(spec, label_map, load_weights=False)
-    restore_weights(session.model, payload["model"], weights)
     marker = read_marker(folder)
+    found = _found_range(marker, trained_with, spec, folder)
+    session = open_session(spec, label_map, load_weights=False, thermal_range=found)
+    restore_weights(session.model, payload["model"], weights)
     return replace(
         session,
         step=step_of(payload, weights),
@@ -196,6 +198,23 @@ def with_weights(
         checkpoint=checkpoint,
         changed=_changed(session, trained_with, None if marker is None else marker["files"]),
     )
+
+
+def _found_range(
+    marker: Marker | None, trained_with: Mapping[str, Any], spec: RunSpec, folder: Path
+) -> Range | None:
+    """Return the thermal range that `auto` of a run found; None for another setting.
+
+    Degrees Celsius are those of any data set with a unit, stored values those of one without.
+    """
+    trained, now = (plain["dataset"].get("thermal_range") for plain in (trained_with, spec.plain))
+    limits = trained.get("range") if isinstance(trained, Mapping) else trained
+    if limits != "auto" or isinstance(trained, Mapping) != isinstance(now, Mapping):
+        return None
+    low, high = (0.0, 0.0) if marker is None else marker.get("thermal_range", (0.0, 0.0))
+    if not low < high:
+        raise InputError(f"{folder / 'dataset.json'} has no thermal_range of the run; {ADVICE}.")
+    return low, high
 
 
 def _changed(

@@ -21,8 +21,10 @@ from rgbt.config.compose import compose, flatten
 from rgbt.config.stored_config import read_settings
 from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
+from rgbt.data.file_dataset import FileDataset
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.dataset import LabelledDataset
+from rgbt.data.thermal import Range
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.engine.device import (
     autocast,
     choose_device,
@@ -55,6 +57,8 @@ class Session:
         consistency: virtual views that TC and CA are measured on, if any.
         model: the network, on the device, not wrapped.
         weights: what it took from a file, None where it is random.
+        thermal_range: what `auto` found, in degrees Celsius where the data set has a unit; None:
+            another setting.
         step: the optimiser step of trained weights; 0 where none is known.
         folder: of the run whose network it is; of another network, where its evaluations lie.
         label: name of the trained network in tables.
@@ -79,6 +83,7 @@ class Session:
     device: torch.device
     model: nn.Module
     weights: Plan | None
+    thermal_range: Range | None = None
     step: int = 0
     folder: Path = Path()
     label: str = ""
@@ -117,6 +122,7 @@ def open_session(
     load_weights: bool = True,
     network: nn.Module | None = None,
     device: torch.device | None = None,
+    thermal_range: Range | None = None,
 ) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
@@ -126,6 +132,7 @@ def open_session(
         load_weights: False: `model.weights` is left out, because an upstream run is not finished.
         network: used as it is; None: built, with weights drawn from (seed, "weights").
         device: where the network is placed; None: `choose_device` of the settings.
+        thermal_range: used where the data set has `auto`; None: found in its training images.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the file of weights.
@@ -141,6 +148,8 @@ def open_session(
         model: nn.Module = spec.model.build() if network is None else network
     dataset: LabelledDataset = built["dataset"]
     check_dataset(dataset)
+    reader = reader_of(dataset)
+    found = reader.settle_range(thermal_range) if isinstance(reader, FileDataset) else None
     if loading.cache is not None:
         dataset = CachedDataset(dataset, loading.cache)
     num_classes = spec.model.values.get("num_classes", dataset.num_classes)
@@ -168,6 +177,7 @@ def open_session(
         device=device,
         model=place(model, device, trainer),
         weights=weights,
+        thermal_range=found,
     )
 
 

@@ -39,6 +39,7 @@ from rgbt.requirements import (
     check_requirements,
     record_of,
 )
+from rgbt.runs.folder import read_marker
 from rgbt.runs.needs import missing_files
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
@@ -175,7 +176,14 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     """
     missing = () if upstream_finished else [upstream.key for upstream in spec.dependencies]
     fabric = open_fabric(spec.trainer)
-    session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
+    # A run that resumes reads its images as before, whatever was added to them.
+    started = None if spec.fresh else read_marker(spec.folder)
+    session = open_session(
+        spec,
+        load_weights=WEIGHTS not in missing,
+        device=fabric.device,
+        thermal_range=None if started is None else started.get("thermal_range"),
+    )
     session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
     # Read at most once, by the first loss that asks for it.

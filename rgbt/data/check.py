@@ -26,7 +26,9 @@ from rgbt.config.command import command
 from rgbt.config.component import build
 from rgbt.cores import usable_cores
 from rgbt.data.file_dataset import FileDataset, SplitNames
+from rgbt.data.images import PairReader
 from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
+from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
 
@@ -35,6 +37,8 @@ Sentences = list[tuple[str, str]]
 
 # In sentences of one kind: values, which are kept, and paths and other numbers, which are not.
 VARYING = re.compile(r"((?:label|thermal) value -?[\d.e+-]+|colour \[[^]]*\])|\S*/\S*|\d+")
+# Bins of a histogram, and their heights.
+BINS, HEIGHTS = 24, " .:-=+*#@"
 OF_FILE = re.compile(r"'([^']+)'|(\S*/\S+)")
 
 
@@ -44,7 +48,8 @@ class SplitReport:
 
     `read` and `unlabelled` count each name once; `day` and `night` leave out mirrored copies.
     `sizes` has the number of images of each (height, width); `pixels` and `images` (K + 1,) the
-    pixels of each class and the images that show it, ignored pixels last.
+    pixels of each class and the images that show it, ignored pixels last. `thermal` has stored
+    values (`points_of`) of all images, "", and of those by "day" and at "night".
     """
 
     names: int
@@ -56,6 +61,7 @@ class SplitReport:
     sizes: dict[tuple[int, ...], int]
     pixels: PixelCounts
     images: PixelCounts
+    thermal: dict[str, NDArray[np.float64]]
 
 
 class Content(NamedTuple):
@@ -64,6 +70,7 @@ class Content(NamedTuple):
     hw: tuple[int, ...]
     pixels: PixelCounts | None
     thermal: str  # type of the stored values: uint8, uint16, float
+    points: NDArray[np.float64]  # of the stored values
     problems: list[str]
     notes: list[str]
 
@@ -88,9 +95,10 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
         )
     report = check_dataset(dataset, num_threads=usable_cores(), is_shown=True)
     print_rich(plain_text(f"{dataset.name} ({type(dataset).__name__}): {dataset.root}"))
-    for table in tables(dataset, report):
+    for table in (*tables(dataset, report), thermal_table(dataset, report)):
         print_rich(rich_table(table))
-    lines = [f"note: {note}" for note in report.notes]
+    lines = [range_line(dataset.images)] if any(r.read for r in report.splits.values()) else []
+    lines += [f"note: {note}" for note in report.notes]
     lines += [f"problem: {problem}" for problem in report.problems]
     lines += [f"{len(report.problems)} problem(s), {len(report.notes)} note(s)."]
     print_rich(plain_text("\n".join(lines)))
@@ -121,6 +129,46 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
     return TextTable("", header, tuple(rows)), TextTable("", columns, tuple(shares))
 
 
+def thermal_table(dataset: FileDataset, report: DatasetReport) -> TextTable:
+    """Return a table of the thermal values of each split, by day and at night, with a histogram.
+
+    Each histogram has the same ends, between which all but `TAIL` of the values lie on each side,
+    and the height of its own largest bin.
+    """
+    unit = dataset.images.unit
+    form = "{:.5g}" if unit is None else "{:.1f}"
+    found: dict[str, NDArray[np.float64]] = {}
+    for split, report_of in report.splits.items():
+        for time, points in report_of.thermal.items():
+            if points.size and not dataset.repeats(split):
+                found[f"{split} {time}".strip()] = points if unit is None else unit.degrees(points)
+    if not found:
+        return TextTable("", ("thermal",), ())
+    every = np.concatenate(list(found.values()))
+    ends = np.quantile(every, (TAIL, 1 - TAIL))
+    rows = []
+    for name, points in found.items():
+        values = [points.min(), *np.quantile(points, (TAIL, 0.5, 1 - TAIL)), points.max()]
+        counts = np.histogram(points.clip(*ends), BINS, tuple(ends))[0]
+        heights = np.ceil(counts / counts.max() * (len(HEIGHTS) - 1)).astype(int)
+        bars = "".join(HEIGHTS[height] for height in heights)
+        rows.append((name, *(form.format(value) for value in values), bars))
+    share = f"{TAIL:.1%}", "median", f"{1 - TAIL:.1%}"
+    what = "thermal values" if unit is None else "thermal, Celsius"
+    histogram = " to ".join(map(form.format, ends))
+    return TextTable("", (what, "lowest", *share, "highest", histogram), tuple(rows))
+
+
+def range_line(images: PairReader) -> str:
+    """Say which thermal values become black and white."""
+    if images.chosen_range is None:
+        return "thermal: grey levels of 8 bits, used as they are."
+    low, high = images.chosen_range
+    of_unit = "" if images.unit is None else " degrees Celsius"
+    by = "" if images.find_range is None else ", found by auto in images of the split train"
+    return f"thermal: {low:g} becomes black, {high:g}{of_unit} white{by}."
+
+
 def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
     """Write sizes with their number of images; of many, the smallest and the largest."""
     texts = [f"{height}x{width} ({number})" for (height, width), number in sorted(sizes.items())]
@@ -132,7 +180,11 @@ def _in_words(sizes: Mapping[tuple[int, ...], int]) -> str:
 def check_dataset(
     dataset: FileDataset, *, num_threads: int = 4, is_shown: bool = False
 ) -> DatasetReport:
-    """Read every sample of the splits, in threads, and report problems; progress goes to stderr."""
+    """Read every sample of the splits, in threads, and report problems; progress goes to stderr.
+
+    InputError: `auto` finds no thermal range.
+    """
+    dataset.settle_range(None)  # once, before threads need it
     lists: dict[str, tuple[str, ...]] = {}
     problems: Sentences = []
     notes: Sentences = []
@@ -149,7 +201,8 @@ def check_dataset(
         else:
             contents[name] = found
     problems += [(name, text) for name, found in contents.items() for text in found.problems]
-    problems += _mixed(contents)
+    stored = {name: (content.thermal, content.points) for name, content in contents.items()}
+    problems += mixed(stored, dataset.images.unit)
     notes += [(name, text) for name, found in contents.items() for text in found.notes]
     splits = {split: _report(dataset, names, contents) for split, names in lists.items()}
     problems += _list_problems(dataset, lists)
@@ -193,25 +246,12 @@ def _read(
         yield from track(results, "reading", len(names), console=console, disable=not is_shown)
 
 
-def _mixed(contents: Mapping[str, Content]) -> Sentences:
-    """Find images whose thermal values are stored with another type than those of most."""
-    counts = Counter(content.thermal for content in contents.values())
-    if not counts:
-        return []
-    usual = counts.most_common(1)[0][0]
-    return [
-        (name, f"thermal is {content.thermal}, of most images {usual}; store values of one type.")
-        for name, content in contents.items()
-        if content.thermal != usual
-    ]
-
-
 def _content_of(dataset: FileDataset, name: str) -> Content:
     """Read the files of a sample; InputError as of `FileDataset.read`."""
     whole = dataset.whole(name)
     sample, values = dataset.made(name, whole), dataset.images.cut(whole[1], name)
     pixels = None if sample.label is None else label_pixels(sample.label, dataset.num_classes)
-    kind = "float" if values.dtype.kind == "f" else str(values.dtype)
+    kind = kind_of(values)
     problems = []
     if sample.thermal.min() == sample.thermal.max():
         is_flat = values.min() == values.max()
@@ -221,7 +261,7 @@ def _content_of(dataset: FileDataset, name: str) -> Content:
         f"thermal value {value:g} is far from all others (no data?), and used as it is."
         for value in (() if kind == "uint8" else lonely_values(values))
     ]
-    return Content(sample.thermal.shape, pixels, kind, problems, notes)
+    return Content(sample.thermal.shape, pixels, kind, points_of(values), problems, notes)
 
 
 def lonely_values(values: NDArray[Any]) -> list[float]:
@@ -242,7 +282,13 @@ def _report(
     own = [contents[name] for name in dict.fromkeys(names) if name in contents]
     labelled = [content.pixels for content in own if content.pixels is not None]
     counts = np.array(labelled, np.int64).reshape(-1, dataset.num_classes + 1)
-    kinds = Counter(_kind_of(dataset, name) for name in names)
+    times = {name: _kind_of(dataset, name) for name in names}
+    kinds = Counter(times[name] for name in names)
+    points: dict[str, list[NDArray[np.float64]]] = {"": [], "day": [], "night": []}
+    for name in dict.fromkeys(names):
+        if name in contents:
+            points[""].append(contents[name].points)
+            points.get(times[name], []).append(contents[name].points)
     return SplitReport(
         names=len(names),
         read=len(own),
@@ -253,6 +299,7 @@ def _report(
         sizes=dict(Counter(content.hw for content in own)),
         pixels=counts.sum(0),
         images=(counts > 0).sum(0),
+        thermal={time: np.array(values) for time, values in points.items()},
     )
 
 

@@ -13,10 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.files import read_names, stored_hw, within
-from rgbt.data.images import PairReader, Range, check_size
+from rgbt.data.files import read_names, read_packed, stored_hw, within
+from rgbt.data.images import PairReader, check_size
 from rgbt.data.labels import LabelCodes
 from rgbt.data.patterns import FrameFiles, Patterns
+from rgbt.data.thermal import (
+    MOST_IMAGES,
+    Range,
+    ThermalRange,
+    found_range,
+    kind_of,
+    mixed,
+    points_of,
+    unit_and_limits,
+)
 from rgbt.requirements import DatasetRecord
 from rgbt.types import Sample
 
@@ -97,21 +107,52 @@ class FileDataset:
             for word in chosen:
                 check_choice(f"dataset.{key}", word, self.classes)
 
-    def follow(self, rgb: str, thermal: str, label: str | None, limits: Range | None) -> None:
+    def follow(
+        self, rgb: str, thermal: str, label: str | None, setting: ThermalRange | None
+    ) -> None:
         """Read images by the patterns of a user's configuration; InputError for invalid ones."""
-        if limits is not None and not limits[0] < limits[1]:
-            raise InputError(
-                f"dataset.thermal_range: expected [low, high], got {list(limits)}: the thermal "
-                "values that become black and white."
-            )
+        unit, limits = unit_and_limits(setting)
         self.patterns = Patterns.of(rgb, thermal, label)
         self.images = PairReader(
             layouts=(self.patterns._replace(label=None),),
-            thermal_range=limits,
+            thermal_range=None if limits == "auto" else limits,
+            unit=unit,
+            find_range=self._found_range if limits == "auto" else None,
             advice="dataset.thermal with the pattern of dataset.rgb reads a fourth channel as "
             "thermal; values that are no grey levels of 8 bits require dataset.thermal_range="
             "[low, high], the values that become black and white",
         )
+
+    def settle_range(self, found: Range | None) -> Range | None:
+        """Return the thermal range that `auto` found, and use `found` instead if it is given.
+
+        None where the setting is not `auto`. InputError: no image of the split train is readable.
+        """
+        if self.images.find_range is None:
+            return None
+        if found is not None:
+            self.images = replace(self.images, thermal_range=found, find_range=None)
+        return self.images.chosen_range
+
+    def _found_range(self) -> Range:
+        """Return percentiles of thermal values of the split train; InputError: values of a mix."""
+        names, images, errors = self.names("train"), {}, []
+        for name in names[:: -(-len(names) // MOST_IMAGES)]:
+            try:
+                rgb, thermal = (within(path, self.root) for path in self.frame(name)[2:4])
+                stored = read_packed(rgb, "")[1] if rgb == thermal else self.images.values(thermal)
+                values = self.images.cut(stored, name)
+            except InputError as error:  # one of many: the training reports it
+                errors.append(str(error))
+            else:
+                images[name] = kind_of(values), points_of(values)
+        if not images:
+            raise InputError(f"dataset.thermal_range=auto: {errors[0]}")
+        unlike = mixed(images, self.images.unit)
+        if unlike:
+            what = f"{len(unlike)} of {len(images)} training images, first '{unlike[0][0]}'"
+            raise InputError(f"dataset.thermal_range=auto: {what}: {unlike[0][1]}")
+        return found_range(np.stack([points for _, points in images.values()]), self.images.unit)
 
     def listed(self, split: str) -> tuple[str, ...]:
         """Return the names of a known split; () if there are none, InputError if unreadable."""
@@ -240,7 +281,7 @@ class FileDataset:
         return {
             "codes": sorted(self.codes.codes.items()),
             "layouts": [str(layout) for layout in self.images.layouts],
-            "thermal_range": self.images.thermal_range,
+            "thermal_range": self.images.limits,
             "most_tint": self.images.most_tint,
             "crop": self.images.crop,
         }

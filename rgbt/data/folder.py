@@ -19,9 +19,9 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, Lists, SplitNames, hash_of_files
-from rgbt.data.images import Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
 from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, FrameFiles, find_frames, in_order, without_rgb
+from rgbt.data.thermal import ThermalRange
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 
@@ -57,7 +57,7 @@ class Folder(FileDataset):
         ids: dict[LabelValue, Text] | None = None,
         colours: dict[Text, Colour | tuple[Colour, ...]] | None = None,
         ignored: tuple[LabelValue | Colour, ...] = (),
-        thermal_range: Range | None = None,
+        thermal_range: ThermalRange | None = None,
         night: Text | None = None,
     ) -> None:
         if palette is None:

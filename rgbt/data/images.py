@@ -6,24 +6,23 @@ images of any folder are read like the training images.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.files import decode, read_array, read_packed, read_rgb
+from rgbt.data.files import read_packed, read_rgb
 from rgbt.data.patterns import Patterns
+from rgbt.data.thermal import Range, Unit, check_unit, maker_of, read_thermal
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
-Level = Annotated[float, Interval(ge=-1e6, le=1e6)]
-Range = tuple[Level, Level]
 
 
 @runtime_checkable
@@ -42,7 +41,10 @@ class PairReader:
 
     Attributes:
         layouts: path patterns of the images of the data set, without labels.
-        thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
+        thermal_range: (low, high) that become black and white, in degrees Celsius where there is a
+            unit, else stored values; None: 8 bit.
+        unit: of the stored values.
+        find_range: computes `thermal_range` at its first use, where the setting is "auto".
         most_tint: grey levels by which the three channels of a thermal image may differ at a pixel;
             grey is their mean, floor((c1 + c2 + c3) / 3 + 1/2).
         crop: first row, row after the last, first column, column after the last of the part that
@@ -52,9 +54,22 @@ class PairReader:
 
     layouts: tuple[Patterns, ...]
     thermal_range: Range | None = None
+    unit: Unit | None = None
+    find_range: Callable[[], Range] | None = None
     most_tint: int = 0
     crop: tuple[int, int, int, int] | None = None
     advice: str = "use the original file"
+
+    @cached_property
+    def chosen_range(self) -> Range | None:
+        """`thermal_range`, or the one that `auto` finds."""
+        return self.thermal_range if self.find_range is None else self.find_range()
+
+    @cached_property
+    def limits(self) -> Range | None:
+        """Stored values that become black and white."""
+        found = self.chosen_range
+        return found if found is None or self.unit is None else self.unit.stored(found)
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
         """Read the pair `name` from two files like a training sample, without a label.
@@ -79,18 +94,25 @@ class PairReader:
         Of two sizes, that of the label, `label_hw`, is taken for the right one.
         """
         if rgb == thermal:
+            if maker_of(rgb) is not None:
+                raise InputError(
+                    f"{rgb} is a radiometric JPEG, whose photo shows other pixels than its "
+                    "measurement; write both with rgbt.data.thermal.unpack_flir, and align them."
+                )
             return read_packed(rgb, "give separate images of RGB and thermal")
-        is_array = thermal.suffix.lower() == ".npy"
         pixels = read_rgb(rgb, self.advice)
-        values = read_array(thermal, "numbers") if is_array else decode(thermal)
-        values = self.check_values(values, thermal)
+        values = self.values(thermal)
         other = rgb if label_hw == values.shape else thermal
         check_size(pixels.shape[:2], "thermal", values, name, other)
         return pixels, values
 
+    def values(self, path: Path) -> NDArray[Any]:
+        """Read the stored thermal values (H, W) of a whole image; errors as of `read`."""
+        return self.check_values(read_thermal(path, self.unit), path)
+
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
         """Make the sample of whole images: cut, thermal as grey levels; errors as of `read`."""
-        levels = grey(self.cut(values, name), self.thermal_range, path)
+        levels = grey(self.cut(values, name), self.limits, path)
         cut = np.ascontiguousarray(self.cut(pixels, name))
         return Sample(rgb=cut, thermal=np.ascontiguousarray(levels), label=None, name=name)
 
@@ -99,7 +121,7 @@ class PairReader:
 
         InputError, in a message with the name `path`: channels that differ, other bits, or NaN.
         """
-        if self.thermal_range is None:
+        if self.thermal_range is None and self.find_range is None:
             wanted, fits = "thermal values of 8 bits per pixel", values.dtype == np.uint8
         else:
             wanted, fits = "thermal values", values.dtype.kind in "iuf"
@@ -111,6 +133,7 @@ class PairReader:
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             wrong = np.count_nonzero(~np.isfinite(values))
             raise InputError(f"{path}: {wrong} thermal values are NaN or infinite; replace them.")
+        check_unit(values, self.unit, path)
         if values.ndim == 2:
             return values
         # Whole channels are compared: comparing their interleaved pixels takes five times as long.

@@ -145,7 +145,7 @@ def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
         images = images_of(dataset)
         path = Path("thermal")
         return images.sample("image", rgb, images.check_values(thermal, path), path)
-    limits = reader.images.thermal_range if isinstance(reader, ReadsPairs) else None
+    limits = reader.images.limits if isinstance(reader, ReadsPairs) else None
     if limits is not None and limits[0] < 255:
         raise InputError(
             f"thermal: 8 bits may be grey levels or values of dataset.thermal_range={list(limits)};"

@@ -15,7 +15,7 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames, hash_of_files
-from rgbt.data.images import PairReader, Range
+from rgbt.data.images import PairReader
 from rgbt.data.labels import LabelCodes, LabelValue, label_codes, painted
 from rgbt.data.patterns import (
     NAME,
@@ -26,6 +26,7 @@ from rgbt.data.patterns import (
     in_order,
     without_rgb,
 )
+from rgbt.data.thermal import ThermalRange
 from rgbt.dataset import DatasetWrapper, LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
@@ -263,7 +264,7 @@ class Video(VideoDataset):
         gaps: Gaps = "refuse",
         ids: dict[LabelValue, Text] | None = None,
         ignored: tuple[LabelValue, ...] = (),
-        thermal_range: Range | None = None,
+        thermal_range: ThermalRange | None = None,
     ) -> None:
         colours = painted(num_classes) if palette is None else palette
         common = (root, name, num_classes, classes, colours)

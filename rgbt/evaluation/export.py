@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -109,7 +109,7 @@ def export(
         image_hw=size,
         dynamic=is_dynamic,
         # The address of the tracking may hold a password, and does not change a prediction.
-        settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
+        settings={**with_range(session), "tracking": {"_target_": NO_TRACKING}},
     )
     content = onnx_bytes(graph, description)
     network = ExportedNetwork(content, out)
@@ -135,6 +135,15 @@ def export(
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(out, content)
     return description, comparison, {hw: len(names) for hw, names in by_size.items()}
+
+
+def with_range(session: Session) -> dict[str, Any]:
+    """Return the settings of a session, with what `auto` of the thermal range found."""
+    plain, dataset = dict(session.spec.plain), dict(session.spec.plain["dataset"])
+    if session.thermal_range is not None:
+        limits, unit = list(session.thermal_range), dataset["thermal_range"]
+        dataset["thermal_range"] = {**unit, "range": limits} if isinstance(unit, dict) else limits
+    return {**plain, "dataset": dataset}
 
 
 def check_out(out: Path) -> None:

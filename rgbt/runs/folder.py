@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, NotRequired, cast
 
 from annotated_types import Len
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
@@ -136,8 +136,13 @@ class ResultForm(TypedDict, total=False):
     test: dict[str, float | None]
 
 
-# ``dataset.json``: digests of names and files of the images.
-MARKER = Annotated[dict[Literal["names", "files"], str], Len(2)]
+class Marker(TypedDict):
+    """``dataset.json``: digests of names and files of the images, and what `auto` found in them."""
+
+    names: str
+    files: str
+    thermal_range: NotRequired[tuple[float, float]]
+
 
 # ``provenance.json``: an entry of every process; a list of them in the archive.
 PROVENANCE = Annotated[dict[Literal["processes"], list[dict[str, Any]]], Len(1)]
@@ -169,9 +174,9 @@ def read_description(folder: Path) -> Description | None:
     return cast("Description | None", _read(folder / "run.json", Description))
 
 
-def read_marker(folder: Path) -> dict[str, str] | None:
+def read_marker(folder: Path) -> Marker | None:
     """Read ``dataset.json``; None: there is none."""
-    return cast("dict[str, str] | None", _read(folder / "dataset.json", MARKER))
+    return cast("Marker | None", _read(folder / "dataset.json", Marker))
 
 
 def read_tables(folder: Path) -> ResultTables | None:
@@ -314,7 +319,7 @@ class RunFolder:
         """Mark the run as finished; everything else must be written before."""
         self._write_json("result.json", result)
 
-    def mark(self, marker: Mapping[str, str]) -> None:
+    def mark(self, marker: Marker) -> None:
         """Write ``dataset.json``, which identifies the images."""
         self._write_json("dataset.json", marker)
 

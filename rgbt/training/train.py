@@ -38,6 +38,7 @@ from rgbt.processes import computed_once, rank
 from rgbt.requirements import NetworkRecord, TransformRecord, record_of
 from rgbt.runs.folder import (
     Description,
+    Marker,
     RunFolder,
     counts_name,
     read_description,
@@ -156,7 +157,9 @@ class Training(Hooks):
     def _claim(self, fingerprint: str) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         root = self.session.dataset.root
-        now = {"names": names_key(self.session), "files": fingerprint}
+        now: Marker = {"names": names_key(self.session), "files": fingerprint}
+        if self.session.thermal_range is not None:
+            now["thermal_range"] = self.session.thermal_range
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
