@@ -314,8 +314,9 @@ def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[CountsOf
         if labels.count(label) > 1:
             label = str(stored.path) if stored.seed is None else f"{label} seed {stored.seed}"
         settings = stored.run.settings if stored.run else {}
-        background = settings.get("dataset", {}).get("background") or ()
-        named.append((label, stored.counts, tuple(background)))
+        own = settings.get("dataset", {}).get("background") or ()
+        background = tuple(name for name in stored.counts.classes if name in own)
+        named.append((label, stored.counts, background))
     return named
 
 

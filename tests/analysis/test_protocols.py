@@ -109,6 +109,14 @@ def test_protocol_of_the_counts_is_marked(changed: dict[str, object], row: tuple
     assert "in an image: 8 to 10." in table.notes[0]
 
 
+def test_unscored_background_is_in_the_mean_of_its_rule() -> None:
+    """Counts whose means leave out the ground have the same scores by each rule."""
+    frames = []
+    for unscored in ((), GROUND):
+        frames.append(protocol_scores("ours", two_images(unscored=unscored), GROUND))
+    np.testing.assert_array_equal(frames[0]["value"], frames[1]["value"])
+
+
 def test_background_that_is_no_class_is_refused() -> None:
     for wrong in ("sky",), CLASSES:
         with pytest.raises(InputError, match=r"^background: "):
@@ -151,7 +159,7 @@ def test_command_shows_and_writes_protocols(call: Call, data: Path, tmp_path: Pa
 def test_counts_of_a_run_have_its_background(call: Call, tmp_path: Path) -> None:
     folder = make_run(tmp_path / "runs", "aaa0", "m", 0)
     (name, *_) = Counts.load(folder / "counts_test.npz").classes
-    (folder / "config.yaml").write_text(f"dataset: {{background: [{name}]}}\n")
+    (folder / "config.yaml").write_text(f"dataset: {{background: [{name}, of_another_map]}}\n")
     code, shown, err = call(entry, "counts=aaa0", f"runs_dir={tmp_path / 'runs'}", "resamples=0")
     assert code == 0, err
     assert f"Background: {name}." in shown
