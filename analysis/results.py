@@ -180,7 +180,7 @@ def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
 
     absent = absent or counts.absent
     rows: list[ScoreRow] = []
-    if _is_plain(counts):
+    if is_plain(counts):
         for subset, part in {ALL: counts, **counts.parts()}.items():
             rows += _part_rows(subset, part, absent, counts.scored)
     else:
@@ -381,7 +381,7 @@ def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evalu
     )
 
 
-def _is_plain(counts: Counts) -> bool:
+def is_plain(counts: Counts) -> bool:
     """Say whether counts are of single frames, without details."""
     return details_of(counts.partition) is None and protocol_of(counts.partition) is None
 

@@ -21,7 +21,7 @@ from analysis.commands import (
     text_table,
     write_files,
 )
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import PredictionFormatOptions, RunsDir
 from rgbt.config.options import Help
 from rgbt.config.overrides import built
@@ -36,6 +36,9 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.tables import TextTable
+
+    # Name of a method, its counts by one partition, and the classes that are its background.
+    CountsOf = tuple[str, Counts, tuple[str, ...]]
 
 # File in a folder of scores that records what was scored.
 SOURCE = "source.txt"
@@ -79,11 +82,18 @@ class ScoreOptions(PredictionFormatOptions, DrawOptions):
         ),
     ] = "refuse"
     name: Annotated[str, Help("name of the method in tables; default: name of the folder")] = ""
+    background: Annotated[
+        str,
+        Help(
+            "classes that are also left out in the table of other protocols, a list with commas; "
+            "default: dataset.background, of counts that of their run"
+        ),
+    ] = ""
     out: Annotated[
         Path | None,
         Help(
-            "output folder of counts_<partition>.npz, maps.npz, scores.md and scores.csv; without "
-            "it, the tables are only printed"
+            "output folder of counts_<partition>.npz, maps.npz, scores.md, scores.csv and "
+            "protocols.csv; without it, the tables are only printed"
         ),
     ] = None
     runs_dir: RunsDir = Path("runs")
@@ -107,33 +117,44 @@ def main(options: ScoreOptions, overrides: list[str]) -> int:
     import pandas as pd
     from rich.console import Group
 
+    from analysis.protocols import protocol_scores, protocol_table
+    from analysis.results import is_plain
     from rgbt.terminal import plain_text, print_rich, rich_table
 
     if bool(options.predictions) == bool(options.counts):
         raise InputError("predictions: expected either predictions=folder or counts=run.")
     out, settings = options.out, options.settings() if options.resamples else None
     _make_room(out, options.source)
+    given = tuple(split_list(options.background, "classes")) if options.background else ()
     if options.counts:
-        counted, remarks = _stored_counts(options, overrides), []
+        counted, remarks, where = _stored_counts(options, overrides), [], ""
     else:
         scored = _scored(options, overrides)
-        counted, remarks = [(scored.name, counts) for counts in scored.counts], scored.remarks()
+        counted = [(scored.name, counts, scored.background) for counts in scored.counts]
+        remarks, where = scored.remarks(), scored.labels
         if out is not None:
             scored.save(out)
-    frames, tables = [], []
+    frames, tables, protocols, other_tables = [], [], {}, []
     with progress("scoring", len(counted)) as advance:
-        for name, counts in counted:
+        for name, counts, own in counted:
             frame = scores(name, counts)
             said = add_intervals(frame, counts, settings) if settings else ""
             frames.append(frame)
             tables += score_tables(frame, counts, said)
+            if name not in protocols and is_plain(counts):  # partitions have the same sums
+                protocols[name] = protocol_scores(name, counts, given or own)
+                other_tables.append(protocol_table(protocols[name], counts, given or own, where))
             advance()
+    tables += other_tables
     print_rich(Group(*map(rich_table, tables)))
     print_rich(plain_text("\n".join(remarks)))
-    title = "# Scores of " + ", ".join(dict.fromkeys(name for name, _ in counted))
+    title = "# Scores of " + ", ".join(dict.fromkeys(name for name, *_ in counted))
     lines = [title, "", *(table.to_markdown() for table in tables), *remarks, ""]
     texts = {"scores.md": "\n".join(lines), SOURCE: f"{options.source}\n"}
-    write_files(out, {**texts, "scores.csv": pd.concat(frames)})
+    made = {"scores.csv": pd.concat(frames)}
+    if protocols:
+        made["protocols.csv"] = pd.concat(protocols.values())
+    write_files(out, {**texts, **made})
     return 0
 
 
@@ -277,7 +298,7 @@ def _scored(options: ScoreOptions, overrides: list[str]) -> FolderScores:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[CountsOf]:
     from analysis.results import open_counts
 
     default = ScoreOptions()
@@ -292,7 +313,10 @@ def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[tuple[st
         label = stored.label
         if labels.count(label) > 1:
             label = str(stored.path) if stored.seed is None else f"{label} seed {stored.seed}"
-        named.append((label, stored.counts))
+        settings = stored.run.settings if stored.run else {}
+        own = settings.get("dataset", {}).get("background") or ()
+        background = tuple(name for name in stored.counts.classes if name in own)
+        named.append((label, stored.counts, background))
     return named
 
 

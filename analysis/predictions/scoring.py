@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from analysis.commands import in_threads
 from analysis.predictions.maps import PixelMaps, add_image
@@ -22,6 +23,7 @@ from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.metric import Absent, Partition, Regions
+from rgbt.metrics.scores import ratio
 
 Resize = Literal["refuse", "nearest", "stretch"]
 
@@ -29,6 +31,9 @@ PARTITIONS: tuple[Partition, ...] = get_args(Partition)
 
 # Ratio of the aspects of prediction and label, less 1, up to which one is a resized other.
 MOST_STRETCH = 0.05
+
+# IoU that two labels or more gain by other indices of the predictions before a remark says so.
+LEAST_GAIN = 0.1
 
 # Most names that a message lists.
 SHOWN = 3
@@ -67,6 +72,8 @@ class FolderScores:
         extra: names of PNG files that belong to no image of the split (overlays left out).
         resized: name of an image whose prediction had another size -> both sizes, such as "480x640
             to 720x1280".
+        background: classes of the data set that are no object.
+        labels: list of the split and sizes of its labels, in words.
     """
 
     name: str
@@ -74,6 +81,8 @@ class FolderScores:
     maps: PixelMaps | None
     extra: tuple[str, ...]
     resized: dict[str, str]
+    background: tuple[str, ...]
+    labels: str
 
     def save(self, folder: Path) -> None:
         """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz``."""
@@ -96,6 +105,7 @@ class FolderScores:
                 f"{len(self.extra)} other PNG files of the folder belong to no image of the split "
                 f"and were not read ({_listed(self.extra)})."
             )
+        remarks += class_remarks(self.counts[0])
         if self.maps is None:
             remarks.append("The images differ in size, so there is no map by pixel.")
         return remarks
@@ -153,8 +163,8 @@ def score_folder(
     size = _label_of(dataset, names[0]).shape
     sums, lock = np.zeros((2, dataset.num_classes, *size), np.int32), Lock()
 
-    def count(image: str, path: Path) -> tuple[NDArray[np.int64], bool, str]:
-        """Return counts (partitions, R, K, K), whether it is in the maps, and both sizes."""
+    def count(image: str, path: Path) -> tuple[NDArray[np.int64], str, str]:
+        """Return counts (partitions, R, K, K), the size of the label, and both sizes."""
         label, prediction, sizes = _label_of(dataset, image), reader.read(path), ""
         if prediction.shape != label.shape:
             sizes = f"{_size(prediction)} to {_size(label)}"
@@ -165,13 +175,13 @@ def score_folder(
         matrices = []
         for regions in partitions:
             matrices.append(region_counts(label, prediction, dataset.num_classes, regions))
-        return np.stack(matrices), label.shape == size, sizes
+        return np.stack(matrices), _size(label), sizes
 
     shape = (len(partitions), len(names), options.regions, *[dataset.num_classes] * 2)
-    counts, resized, is_one_size = np.zeros(shape, np.int32), {}, True
-    for index, (matrices, is_alike, sizes) in enumerate(in_threads(count, names, paths)):
+    counts, resized, label_sizes = np.zeros(shape, np.int32), {}, set()
+    for index, (matrices, label_size, sizes) in enumerate(in_threads(count, names, paths)):
         counts[:, index] = matrices
-        is_one_size &= is_alike
+        label_sizes.add(label_size)
         if sizes:
             resized[names[index]] = sizes
         advance()
@@ -179,7 +189,7 @@ def score_folder(
     shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
     of: dict[str, Any] = {"split": split, "dataset": dataset.fingerprint()}
     maps = None
-    if is_one_size:
+    if len(label_sizes) == 1:
         about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
         maps = PixelMaps(intersection=sums[0], union=sums[1], **about, **of, **shared)
     # Whatever a method gets to see, the images are those of both cameras.
@@ -189,7 +199,33 @@ def score_folder(
     for by_image, regions in zip(counts, partitions, strict=True):
         measurement = Measurement(partition=regions.name, **of)
         made.append(Counts(counts=by_image, measurement=measurement, **shared))
-    return FolderScores(name, tuple(made), maps, extra, resized)
+    labels = f"{dataset.splits[split]}, labels of {_listed(sorted(label_sizes))} pixels"
+    return FolderScores(name, tuple(made), maps, extra, resized, dataset.background, labels)
+
+
+def class_remarks(counts: Counts) -> list[str]:
+    """Say which classes seem to have another index than that of the data set, or no prediction.
+
+    The IoU of every label with every prediction is compared with that of the best assignment of
+    one prediction to each label. A table alone would show a low score.
+    """
+    matrix, remarks = counts.whole().astype(np.float64), []
+    labelled, predicted = matrix.sum(1), matrix.sum(0)
+    overlap = ratio(matrix, labelled[:, None] + predicted - matrix, "released")
+    best = linear_sum_assignment(overlap, maximize=True)[1]
+    gains = overlap[np.arange(len(best)), best] - overlap.diagonal()
+    gaining = np.flatnonzero(gains > LEAST_GAIN).tolist()
+    if len(gaining) > 1:  # a network that predicts one class alone may fit one other label better
+        fits = [f"{best[label]} as {label} ({counts.classes[label]})" for label in gaining]
+        remarks.append(
+            "The classes seem to have other indices than those of the data set: predictions fit "
+            f"the labels better with {', '.join(fits)}."
+        )
+    absent = np.flatnonzero((labelled > 0) & (predicted == 0) & counts.scored).tolist()
+    if absent:
+        names = ", ".join(counts.classes[label] for label in absent)
+        remarks.append(f"No prediction holds these classes of the labels: {names}.")
+    return remarks
 
 
 def _label_of(dataset: LabelledDataset, image: str) -> Array:

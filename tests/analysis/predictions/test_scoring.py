@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from analysis import commands
-from analysis.predictions.scoring import ScoringOptions, find, score_folder
+from analysis.predictions.scoring import ScoringOptions, class_remarks, find, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.predictions import Affixes
 from rgbt.metrics.metric import Regions
+from tests.analysis.counts import counts_of
 from tests.analysis.predictions.conftest import LABELS, PREDICTIONS, Write
 
 STRIPS = ScoringOptions(partitions=("vertical", "horizontal"), regions=2)
@@ -146,3 +147,32 @@ def test_missing_files_are_refused(tmp_path: Path) -> None:
         (tmp_path / f"{name}.png").touch()
     with pytest.raises(InputError, match=r"lacks 1 of the 2 .*\(a\.png\).* contains .* and 1 more"):
         find(tmp_path, ("a", "b"), Affixes())
+
+
+def test_classes_with_other_indices_are_reported(tiny: MFNet, write: Write) -> None:
+    """Car and person exchanged: car 0 / 3 instead of 3 / 4, person 0 / 4 instead of 1 / 3."""
+    other = {name: np.array([0, 2, 1])[np.array(value)] for name, value in PREDICTIONS.items()}
+    remarks = score_folder(write(other), tiny, "test", STRIPS).remarks()
+    assert len(remarks) == 1
+    assert "better with 2 as 1 (car), 1 as 2 (person)." in remarks[0]
+    own = score_folder(write(PREDICTIONS, "own"), tiny, "test", STRIPS)
+    assert own.remarks() == []
+
+
+@pytest.mark.parametrize(
+    ("exchanged", "reported"), [((10, 10), False), ((11, 11), True), ((90, 0), False)]
+)
+def test_other_indices_need_two_labels_that_gain(
+    exchanged: tuple[int, int], reported: bool
+) -> None:
+    """Of 100 pixels of b and of c, n are predicted as the other: it gains n / 100 by exchange."""
+    one, other = exchanged
+    matrix = [[9999, 0, 0], [100 - one, 0, one], [100 - other, other, 0]]
+    remarks = class_remarks(counts_of(np.array([[matrix]])))
+    assert any("other indices" in remark for remark in remarks) == reported
+
+
+def test_classes_that_are_never_predicted_are_named(tiny: MFNet, write: Write) -> None:
+    folder = write({name: np.zeros((4, 4)) for name in PREDICTIONS})
+    remarks = score_folder(folder, tiny, "test", STRIPS).remarks()
+    assert remarks == ["No prediction holds these classes of the labels: car, person."]
