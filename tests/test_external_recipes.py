@@ -17,12 +17,14 @@ from rgbt.models.external.network import ExternalNetwork
 
 FOLDER = conf_dir() / "model" / "external"
 RECIPES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
+CHANNELS = {"rtfdnet": 3, "frequency_guided": 1}
+"""Of thermal, where a stacked tensor has not four channels, or both images apart not three each."""
 
 
 def test_recipes_are_choices_of_the_group() -> None:
     assert available("model/external") == RECIPES
     assert "external" in available("model")
-    assert len(RECIPES) == 25
+    assert len(RECIPES) == 31
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +49,11 @@ def test_recipe_has_the_classes_of_the_data_set(nodes: DictConfig, classes: int)
         counts = [each[key] for each in spaces for key in each if re.match(r"n(um)?_class", key)]
         assert counts == [classes], f"{name}: exactly one argument has the number of classes"
         adapter = adapter_of(values["constructor"])
-        pattern = r"[\w.]+:\w+" if adapter is None else rf"adapters\.py:{name}"
+        pattern = r"[\w.]+:\w+" if adapter is None else rf"adapters(_2026)?\.py:{name}"
         assert re.fullmatch(pattern, values["constructor"])
         assert set(values) == set(inspect.signature(ExternalNetwork).parameters)
-        # A stacked tensor has four channels in all recipes; both images apart have three each.
         channels = len(nodes[name].inputs.thermal_mean)
-        assert channels == (1 if nodes[name].feed == "stacked" else 3), name
+        assert channels == CHANNELS.get(name, 1 if nodes[name].feed == "stacked" else 3), name
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -16,6 +16,9 @@ FACT = re.compile(
     r"Lists: (?P<lists>.*?)\.(?: (?P<remarks>.*))?$"
 )
 """The comment at the top of a recipe, in one line."""
+PACKAGES = re.compile(r"[Tt]he packages? (.*?) (?:is|are) necessary")
+TRIED = re.compile(r" ?Tried: (.*?)\.$")
+"""In the remarks of a recipe."""
 
 
 def external_page() -> str:
@@ -44,6 +47,13 @@ def external_page() -> str:
         "Published figures are those of the README, or of the paper if the column names it. "
         "Figures of papers were not compared with the text. *Lists* are those that the published "
         'weights were trained and selected on; "not checked" where the repository does not say.',
+        "## What they need, and what was tried",
+        "On a CPU and from random weights, with the packages beside PyTorch that the recipe names. "
+        "*Trained* means six steps on the embedded data set, with a finite loss that changes.",
+        table(
+            ["`model=external/`", "Packages", "Tried"],
+            [_attempt(each) for each in files],
+        ),  # fmt: skip
         "## How they are called",
         table(
             ["`model=external/`", "Constructor", "Feed", "Inputs", "Sizes", "Scores"],
@@ -79,6 +89,16 @@ def _origin(file: ConfigFile) -> list[str]:
         link,
         stated["commit"],
         stated["licence"],
+    ]
+
+
+def _attempt(file: ConfigFile) -> list[str]:
+    remarks = facts(file)["remarks"] + "."
+    packages, tried = PACKAGES.search(remarks), TRIED.search(remarks)
+    return [
+        code(file.name),
+        packages[1] if packages else "-",
+        tried[1] if tried else "built and predicted (2026-11-26)",
     ]
 
 

@@ -28,8 +28,9 @@ def tables_page() -> str:
     ]
     return page(
         "# Published tables",
-        "Each results table of the four papers is a file. `rgbt reproduce table=NAME` runs its "
-        "rows, where they can be run, and prints them beside the published values. Measured "
+        "Each results table of the four papers is a file, and `field/2026` has printed numbers of "
+        "other networks. `rgbt reproduce table=NAME` runs the rows, where they can be run, and "
+        "prints them beside the published values. Measured "
         "values are on the pages of [Results](../results/index.md).",
         table(["Table", "Caption", "Rows that can be run"], rows),
         *sections,

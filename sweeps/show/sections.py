@@ -45,6 +45,8 @@ class TableSection:
     Attributes:
         page: the folder of its file; all studies of ours have one.
         is_run: whether it has a finished run.
+        is_printed: whether it has no run because none of its rows can be run; then its grid has the
+            published values alone.
         frame: its claims (`claims_frame`), `counted` by verdict in a sentence, and as `claims`.
         grids: the table, then the effects of its design.
         drawn: its figure, and `figure` the name of its file; None, and "", without one.
@@ -55,6 +57,7 @@ class TableSection:
         request = judged.request
         folder, slash, _ = request.name.partition("/")
         self.judged, self.is_run = judged, bool(judged.runs)
+        self.is_printed = not self.is_run and not request.table.runnable_rows
         self.page = folder if slash else STUDIES
         form = "released form" if request.form == "released" else ""
         words = shlex.join(request.extra)
@@ -71,6 +74,8 @@ class TableSection:
         self.figure = ""
         if self.is_run:
             self._show(*effects_of(judged))
+        elif self.is_printed:
+            self.grids = [markdown(replace(grid_of(judged, "markdown"), title=""))]
 
     def _show(self, effects: pd.DataFrame, lacking: Sequence[str]) -> None:
         """Set the grids and the figure of a table that was run."""
@@ -129,6 +134,7 @@ def paper_section(
         "title": title,
         "reference": reference,
         "tables": own,
+        "printed": all(table.is_printed for table in own),
         "counted": counted(frame),
         "judged": [markdown(grid) for grid in claim_grids(frame[is_run])],
         "not_run": "\n".join(lines[~is_run]),

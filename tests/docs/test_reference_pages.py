@@ -75,6 +75,19 @@ def test_a_command_shows_its_options(pages: dict[str, str]) -> None:
     assert "\n### weights inspect\n" in text
 
 
+def test_external_networks_say_what_they_need_and_what_was_tried(pages: dict[str, str]) -> None:
+    text = pages["reference/external-networks.md"]
+    for row in (
+        "| `rtfdnet` | mmengine, matplotlib and mmcv-lite before 2.1 | built, trained, "
+        "evaluated and predicted (2026-11-30) |",
+        "| `sigma_t` | timm, einops and fvcore | built (2026-11-26) |",
+        "| `ecm` | - | built and predicted (2026-11-26) |",
+    ):
+        assert f"\n{row}\n" in text
+    recipes = [path.stem for path in (ROOT / "conf/model/external").glob("*.yaml")]
+    assert all(text.count(f"\n| `{name}` |") == 3 for name in recipes), "in all three tables"
+
+
 def test_every_published_table_is_shown_with_its_values(pages: dict[str, str]) -> None:
     text = pages["reference/tables.md"]
     for path in (ROOT / "sweeps" / "tables").rglob("*.yaml"):

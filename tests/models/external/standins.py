@@ -39,11 +39,19 @@ class Net(Base):
 """
 
 
+# Where modules of the checkouts here, and what stands in for others, begin.
+ROOTS = (
+    *("model", "toolbox", "absent"),
+    *("model1", "backbone_model", "decoder", "proposed"),
+    *("models", "backbone", "model_others", "mamba_ssm"),
+)
+
+
 def forget() -> None:
     """Leave the checkout of this process, as another process would."""
     network._held.clear()
     for name in list(sys.modules):
-        if name.split(".")[0] in ("model", "toolbox", "absent"):
+        if name.split(".")[0] in ROOTS:
             del sys.modules[name]
 
 

@@ -18,7 +18,8 @@ SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].
 FOLDER = SHARED / "published"
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
-OURS = {name: load_table(name) for name in table_names(PUBLISHED)}
+# The table of the field has no file there: each of its rows names its source.
+OURS = {n: load_table(n) for n in table_names(PUBLISHED) if not n.startswith("field/")}
 
 of_reference = pytest.mark.skipif(
     not all((FOLDER / f"{paper}.yaml").is_file() for paper in PAPERS),

@@ -417,3 +417,17 @@ def test_a_claim_is_shown_where_it_is_judged_best() -> None:
         of_report = SimpleNamespace(every=pd.DataFrame(every))
         found = Report._decisive_claims(cast("Report", of_report))
         assert found[list(expected)].to_dict("records") == [expected]
+
+
+def test_a_page_of_printed_numbers_shows_them_without_a_verdict(report: Report) -> None:
+    text = report.page("field")
+    assert text.splitlines()[1] == "# The field: printed numbers"
+    for words in ("tables beside", "claims", "contrasts", "not run", "ours"):
+        assert words not in text
+    (row,) = (line for line in text.splitlines() if line.startswith("| CFDHI-Net"))
+    assert row.split("|")[-2].strip() == "61.50"
+    assert "trained on train and val" in text
+    assert "](field.md)" in report.page("index")
+    assert "field" not in report.page("claims")
+    # A table of a paper without runs is one that could be run.
+    assert "Tables that were not run" in report.page("temporal")
