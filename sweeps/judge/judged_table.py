@@ -330,19 +330,24 @@ class JudgedTable:
             return (None, confirmed), str(error)
 
     def _warnings(self, rows: Mapping[str, Mapping[int, RunResult]]) -> tuple[str, ...]:
-        """What differs between runs that are compared: their lists, and the machines of a seed."""
-        lists: dict[str, dict[str, None]] = {}
+        """What differs between the runs of a seed, which are compared: their lists and machines."""
+        by_seed: dict[int, dict[str, dict[str, None]]] = {}  # seed -> lists -> labels of rows
         machines: dict[int, set[str]] = {}
         for label, runs in rows.items():
             for seed, run in runs.items():
                 origin = self.reader.origin(run)
+                of_seed = by_seed.setdefault(seed, {})
                 if origin.lists:
-                    lists.setdefault(origin.lists, {})[label] = None
+                    of_seed.setdefault(origin.lists, {})[label] = None
                 machines.setdefault(seed, set())
                 if origin.machine:
                     machines[seed].add(origin.machine)
         warnings = []
-        if len(lists) > 1:
+        lists: dict[str, dict[str, None]] = {}
+        for of_seed in by_seed.values():
+            for text, labels in of_seed.items() if len(of_seed) > 1 else ():
+                lists[text] = lists.get(text, {}) | labels
+        if lists:
             shown = "; ".join(f"{', '.join(labels)} {text}" for text, labels in lists.items())
             warnings.append(f"Different lists: {shown}.")
         mixed = [str(seed) for seed, known in machines.items() if len(known) > 1]

@@ -88,13 +88,15 @@ def score(
     for row in table.rows:
         outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
         cells |= _row_cells(table, row, outcomes, reader)
+    folds = table.folds.get(scale)
+    of_folds = f"every seed on its fold of {folds}"
     lists: dict[str, set[str]] = {}
     made_by: dict[str, str | None] = {}
     for (label, _), outcome in runs.items():
         for run in outcome.results:
             made_by[run.key] = run.commit
             if run.lists:
-                lists.setdefault(label, set()).add(run.lists)
+                lists.setdefault(label, set()).add(of_folds if folds else run.lists)
     return ScoredTable(
         name=name,
         table=table,

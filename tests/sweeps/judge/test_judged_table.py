@@ -201,6 +201,14 @@ def test_rows_of_different_lists_or_machines_are_said() -> None:
     )
 
 
+def test_folds_differ_in_lists_and_rows_do_not() -> None:
+    runs = planted({"low": SHARES["low"], "high": SHARES["high"]})
+    for (label, seed), finished in runs.items():
+        run: Any = replace(finished.results[0], lists=f"trained on fold {seed}")  # type: ignore[type-var]
+        runs[label, seed] = replace(finished, results=(run,))
+    assert judge(claim(rows=("high",), against=("low",)), runs).warnings == ()
+
+
 def test_seeds_without_the_evaluation_do_not_count() -> None:
     """Another table may have trained seed 2 of a row, without the measurement of this one."""
     one, runs = claim(rows=("high",), against=("low",)), {}
