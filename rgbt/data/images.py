@@ -78,15 +78,19 @@ class PairReader:
 
         Of two sizes, that of the label, `label_hw`, is taken for the right one.
         """
+        pixels, values = self.unaligned(rgb, thermal)
+        other = rgb if label_hw == values.shape else thermal
+        check_size(pixels.shape[:2], "thermal", values, name, other)
+        return pixels, values
+
+    def unaligned(self, rgb: Path, thermal: Path) -> tuple[Array, NDArray[Any]]:
+        """Read RGB (H, W, 3) and thermal values (H', W') of any two sizes; errors as of `read`."""
         if rgb == thermal:
             return read_packed(rgb, "give separate images of RGB and thermal")
         is_array = thermal.suffix.lower() == ".npy"
         pixels = read_rgb(rgb, self.advice)
         values = read_array(thermal, "numbers") if is_array else decode(thermal)
-        values = self.check_values(values, thermal)
-        other = rgb if label_hw == values.shape else thermal
-        check_size(pixels.shape[:2], "thermal", values, name, other)
-        return pixels, values
+        return pixels, self.check_values(values, thermal)
 
     def sample(self, name: str, pixels: Array, values: NDArray[Any], path: Path) -> Sample:
         """Make the sample of whole images: cut, thermal as grey levels; errors as of `read`."""
@@ -149,7 +153,7 @@ def check_size(
 ) -> None:
     """Refuse an image (H', W') that is not of the size (H, W) of RGB; `path`: the file to mend."""
     if image.shape != hw:
-        remedy = f"both must show the same pixels. Align them first: {path}."
+        remedy = f"both must show the same pixels. Align them first, with rgbt align: {path}."
         if image.shape == hw[::-1]:
             remedy = f"{path} is turned by a quarter; turn it as the others are."
         raise InputError(
