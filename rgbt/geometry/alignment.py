@@ -32,6 +32,9 @@ COARSE_EDGE, MIDDLE_EDGE, FINE_EDGE = 60, 120, 240
 TILES = (12, 16)
 TILE, REACH, FINE_REACH = 80, 8, 4
 
+# Tiles that both images have to show.
+LEAST_TILES = 40
+
 # Blocks of tiles along a column and a row that the jackknife leaves out, one at a time.
 BLOCKS = (3, 4)
 
@@ -65,7 +68,8 @@ class Alignment:
         points: (N, 2) points of RGB.
         partners: (N, 2) the points of thermal measured or clicked for them.
         uncertainty: (21, 21) standard error in thermal pixels on `grid_of` RGB; NaN: unknown.
-        share: of all tiles, those that agree with the homography, 0..1; 1 where there are none.
+        share: of the tiles that both images show, those that agree with the homography, 0..1; 1
+            where there are none.
         scores: of each pair, its mean correlation of edges after alignment; () where unknown.
         outliers: indices of pairs that are aligned otherwise, and were left out.
     """
@@ -100,6 +104,8 @@ def root_mean_square(values: Floats) -> float:
 
 def moved(matrix: Floats, points: Floats) -> Floats:
     """Move points (N, 2) by a homography (3, 3); (N, 2) float64."""
+    if not len(points):  # of which OpenCV returns None
+        return np.empty((0, 2))
     found = cv2.perspectiveTransform(np.asarray(points, np.float64)[:, None], matrix)
     return np.asarray(found[:, 0], np.float64)
 
@@ -202,11 +208,11 @@ def _refined(
         hw = _shrunk(full_hw, edge)
         size = resizing(full_hw, hw)
         local = size @ matrix @ inverse(size)
-        sheets, corners, tile = _sheets(pairs, local, hw, reach)
-        centres = corners + (tile - 1) / 2
+        centres, sheets = _sheets(pairs, local, hw, reach)
         peaks = [_peak(sheet) for sheet in sheets[list(used)].mean(0)]
         inside = np.array([is_inside for _, is_inside in peaks], bool)
-        points, shifts = centres[inside], np.array([shift for shift, _ in peaks])[inside]
+        shifts = np.array([shift for shift, _ in peaks]).reshape(-1, 2)[inside]
+        points = centres[inside]
         step, near = _fitted(points, points + shifts, stage)
         if step is None:
             return None
@@ -224,7 +230,7 @@ def _refined(
         fitted,
         moved(local, (points + shifts)[near]),
         uncertainty,
-        float(near.sum()) / (TILES[0] * TILES[1]),
+        float(near.sum()) / max(len(centres), LEAST_TILES),
         scores,
         outliers,
     )
@@ -232,31 +238,34 @@ def _refined(
 
 def _sheets(
     pairs: Sequence[tuple[Image, Image]], local: Floats, hw: HW, reach: int
-) -> tuple[Floats, Floats, int]:
-    """Correlate tiles of RGB with aligned thermal: (pairs, tiles, shifts, shifts), 0 outside.
+) -> tuple[Floats, Floats]:
+    """Correlate tiles of RGB with aligned thermal, where thermal shows what is near.
 
-    Also returns the first point of each tile, (tiles, 2), and the size of a tile.
+    Returns the middle of each tile, (tiles, 2), and (pairs, tiles, shifts, shifts).
     """
     tile = min(TILE, min(hw) // 3)
     tops, lefts = (
         np.linspace(reach, side - tile - reach, number).round().astype(int)
         for side, number in zip(hw, TILES, strict=True)
     )
-    corners = np.array([(left, top) for top in tops for left in lefts])
-    sheets = np.zeros((len(pairs), len(corners), 2 * reach + 1, 2 * reach + 1))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     covered = cv2.warpPerspective(np.ones(hw, np.uint8), local, hw[::-1], flags=flags)
+    corners, wide = [], tile + 2 * reach
+    for top in tops - reach:
+        for left in lefts - reach:
+            if covered[top : top + wide, left : left + wide].mean() > 0.95:
+                corners.append((left, top))
+    sheets = np.zeros((len(pairs), len(corners), 2 * reach + 1, 2 * reach + 1))
     for index, (rgb, thermal) in enumerate(pairs):
         warped = cv2.warpPerspective(
             _resized(thermal, hw), local, hw[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
         one, other = edges(_resized(rgb, hw)), edges(np.asarray(warped))
         for number, (left, top) in enumerate(corners):
-            wide = np.s_[top - reach : top + tile + reach, left - reach : left + tile + reach]
-            if covered[wide].mean() > 0.95:
-                part = one[top : top + tile, left : left + tile]
-                sheets[index, number] = _correlation(other[wide], part)
-    return sheets, corners, tile
+            inner = one[top + reach : top + reach + tile, left + reach : left + reach + tile]
+            outer = other[top : top + wide, left : left + wide]
+            sheets[index, number] = _correlation(outer, inner)
+    return np.array(corners, np.float64).reshape(-1, 2) + reach + (tile - 1) / 2, sheets
 
 
 def _correlation(image: Image, part: Image) -> Floats:
