@@ -47,6 +47,7 @@ COMMANDS = {
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
     "check": Entry("rgbt.data.check", "validate a whole data set and report its problems"),
+    "align": Entry("rgbt.align", "align RGB and thermal images, or two videos in time"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "archive": Entry("analysis.archive", "keep the results of runs in the repository"),

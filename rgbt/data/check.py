@@ -11,6 +11,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -29,6 +30,8 @@ from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.images import PairReader
 from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
+from rgbt.geometry.alignment import GRID, estimated, grid_of, moved
+from rgbt.geometry.optical_flow import gray_of
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
 
@@ -39,6 +42,9 @@ Sentences = list[tuple[str, str]]
 VARYING = re.compile(r"((?:label|thermal) value -?[\d.e+-]+|colour \[[^]]*\])|\S*/\S*|\d+")
 # Bins of a histogram, and their heights.
 BINS, HEIGHTS = 24, " .:-=+*#@"
+# Pairs that the misalignment is estimated from, distance in pixels that is not reported, and least
+# shorter side of images.
+ALIGNED_PAIRS, ALIGNED_PX, SMALLEST_ALIGNED = 24, 1.0, 64
 OF_FILE = re.compile(r"'([^']+)'|(\S*/\S+)")
 
 
@@ -99,10 +105,53 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
         print_rich(rich_table(table))
     lines = [range_line(dataset.images)] if any(r.read for r in report.splits.values()) else []
     lines += [f"note: {note}" for note in report.notes]
+    lines += [said] if (said := misalignment(dataset, report)) else []
     lines += [f"problem: {problem}" for problem in report.problems]
     lines += [f"{len(report.problems)} problem(s), {len(report.notes)} note(s)."]
     print_rich(plain_text("\n".join(lines)))
     return 1 if report.problems else 0
+
+
+def misalignment(dataset: FileDataset, report: DatasetReport) -> str:
+    """Say how far thermal lies from RGB, estimated from a few pairs; "" if it is little.
+
+    It is little if a side or the middle is off by at most `ALIGNED_PX`, or twice its uncertainty.
+    """
+    sizes = sum((Counter(r.sizes) for r in report.splits.values()), Counter[tuple[int, ...]]())
+    names = [n for split in report.splits for n in dataset.names(split)]
+    names = list(dict.fromkeys(names))
+    if not sizes or min(hw := sizes.most_common(1)[0][0]) < SMALLEST_ALIGNED:
+        return ""
+    pairs = []
+    for index in np.linspace(0, len(names) - 1, min(len(names), ALIGNED_PAIRS)).astype(int):
+        with suppress(InputError):  # it is among the problems
+            sample = dataset.pair(names[index])
+            if sample.thermal.shape == hw:
+                pairs.append((gray_of(sample.rgb), sample.thermal))
+    found = estimated(pairs) if pairs else None
+    if found is None or found.reason((hw[0], hw[1])):
+        return f"alignment: cannot be told from {len(pairs)} pairs."
+    points = grid_of((hw[0], hw[1]), GRID)
+    shifts = np.linalg.norm(moved(found.matrix, points) - points, axis=1).reshape(GRID, GRID)
+    middle = GRID // 2
+    sides: dict[str, Any] = {
+        "right": np.s_[:, -1],
+        "left": np.s_[:, 0],
+        "top": np.s_[0],
+        "bottom": np.s_[-1],
+    }
+    places = {f"at the {side} edge": where for side, where in sides.items()}
+    places["in the middle"] = np.s_[middle, middle]
+    place, off = max(
+        ((p, float(shifts[at].mean())) for p, at in places.items()), key=lambda x: x[1]
+    )
+    error = float(np.sqrt(np.square(found.uncertainty[places[place]]).mean()))
+    if off <= max(ALIGNED_PX, 2 * error):
+        return ""
+    return (
+        f"alignment: thermal is off by about {off:.1f} px {place} (standard error {error:.1f} px, "
+        f"{len(pairs)} pairs); rgbt align measures and corrects it."
+    )
 
 
 def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, TextTable]:

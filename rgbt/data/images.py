@@ -93,6 +93,13 @@ class PairReader:
 
         Of two sizes, that of the label, `label_hw`, is taken for the right one.
         """
+        pixels, values = self.unaligned(rgb, thermal)
+        other = rgb if label_hw == values.shape else thermal
+        check_size(pixels.shape[:2], "thermal", values, name, other)
+        return pixels, values
+
+    def unaligned(self, rgb: Path, thermal: Path) -> tuple[Array, NDArray[Any]]:
+        """Read RGB (H, W, 3) and thermal values (H', W') of any two sizes; errors as of `read`."""
         if rgb == thermal:
             if maker_of(rgb) is not None:
                 raise InputError(
@@ -101,10 +108,7 @@ class PairReader:
                 )
             return read_packed(rgb, "give separate images of RGB and thermal")
         pixels = read_rgb(rgb, self.advice)
-        values = self.values(thermal)
-        other = rgb if label_hw == values.shape else thermal
-        check_size(pixels.shape[:2], "thermal", values, name, other)
-        return pixels, values
+        return pixels, self.values(thermal)
 
     def values(self, path: Path) -> NDArray[Any]:
         """Read the stored thermal values (H, W) of a whole image; errors as of `read`."""
@@ -172,7 +176,7 @@ def check_size(
 ) -> None:
     """Refuse an image (H', W') that is not of the size (H, W) of RGB; `path`: the file to mend."""
     if image.shape != hw:
-        remedy = f"both must show the same pixels. Align them first: {path}."
+        remedy = f"both must show the same pixels. Align them first, with rgbt align: {path}."
         if image.shape == hw[::-1]:
             remedy = f"{path} is turned by a quarter; turn it as the others are."
         raise InputError(

@@ -158,8 +158,9 @@ class VideoDataset(FileDataset):
         problems = self._gaps(videos) + self._unpaired(videos) if self.gaps == "refuse" else []
         if problems:
             raise InputError(
-                f"{problems[0]}; restore it, or set dataset.gaps=split to begin another sequence "
-                "after each gap."
+                f"{problems[0]}; restore it, set dataset.gaps=split to begin another sequence "
+                "after each gap, or pair videos of different rates or starts with rgbt align "
+                "rgb=... thermal=..."
             )
         return tuple(run for video in videos for run in consecutive(self.videos[video]))
 

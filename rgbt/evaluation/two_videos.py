@@ -1,0 +1,116 @@
+"""Pair the frames of two videos in time, and write them as numbered images for dataset=video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, RunError
+from rgbt.data.files import decode
+from rgbt.data.new_images import KINDS
+from rgbt.data.patterns import in_order
+from rgbt.evaluation.images import write_png
+from rgbt.geometry.optical_flow import gray_of
+from rgbt.geometry.time_offset import motion, offset_of, paired, small
+
+# First bytes of MP4, AVI and Matroska, at an offset. Other files that a decoder would open, such as
+# playlists, name further files.
+CONTAINERS = ((4, b"ftyp"), (0, b"RIFF"), (0, b"\x1aE\xdf\xa3"))
+
+Frame = NDArray[Any]
+
+
+class Film(NamedTuple):
+    """Is a video file, or a folder of numbered images, with its frame rate."""
+
+    setting: str
+    path: Path
+    rate_hz: float
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield frames in order, (H, W, 3) R, G, B or (H, W); InputError: unreadable, or none."""
+        if self.path.is_dir():
+            files = [file for file in self.path.iterdir() if file.suffix.lower() in KINDS]
+            files.sort(key=lambda file: in_order(file.name))
+            yield from (decode(file) for file in files)
+            return
+        video = cv2.VideoCapture(str(self.path))
+        try:
+            while (read := video.read())[0]:
+                yield read[1][..., ::-1]
+        finally:
+            video.release()
+
+
+def opened(setting: str, path: Path, rate_hz: float | None) -> Film:
+    """Open a video; its rate is `rate_hz`, or of the file. InputError: no video, or no rate."""
+    if path.is_dir():
+        if rate_hz is None:
+            raise InputError(f"{setting}_fps has no value; a folder of images has no frame rate.")
+        return Film(setting, path, rate_hz)
+    if not path.is_file():
+        raise InputError(f"{setting}={path}: there is no such video file or folder of images.")
+    with path.open("rb") as file:
+        head = file.read(16)
+    if not any(head[at:].startswith(word) for at, word in CONTAINERS):
+        raise InputError(f"{setting}={path}: expected a video in MP4, MOV, AVI, MKV or WebM.")
+    video = cv2.VideoCapture(str(path))
+    rate = rate_hz or float(video.get(cv2.CAP_PROP_FPS))
+    video.release()
+    if not 0 < rate < 10_000:
+        raise InputError(f"{setting}_fps has no value, and {path} names no frame rate.")
+    return Film(setting, path, rate)
+
+
+def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> str:
+    """Write out/rgb/NUMBER.png and out/thermal/NUMBER.png of frames of one time; what was done.
+
+    `offset_s`: how much later the thermal video began; None: estimated by motion.
+
+    Raises:
+        InputError: a video cannot be read, or no two frames are of one time.
+        RunError: the offset cannot be told.
+    """
+    thumbnails = [[small(_grey(frame)) for frame in film.frames()] for film in (rgb, thermal)]
+    for film, frames in zip((rgb, thermal), thumbnails, strict=True):
+        if len(frames) < 2:
+            raise InputError(f"{film.setting}={film.path}: {len(frames)} frames can be read.")
+    rates, how = (rgb.rate_hz, thermal.rate_hz), "given"
+    if offset_s is None:
+        first, second = (motion(frames) for frames in thumbnails)
+        offset_s, how = offset_of(first, second, rates), "estimated by motion"
+    if offset_s is None:
+        raise RunError(
+            "the offset cannot be told from the motion of both videos: too short, still, or of "
+            "even motion. Give offset_s=SECONDS, how much later the thermal video began."
+        )
+    first_length, second_length = map(len, thumbnails)
+    pairs = paired((first_length, second_length), rates, offset_s)
+    if not pairs:
+        raise InputError(f"offset_s={offset_s:g}: no two frames are of one time.")
+    for side, film in enumerate((rgb, thermal)):
+        numbers: dict[int, list[int]] = {}
+        for number, pair in enumerate(pairs):
+            numbers.setdefault(pair[side], []).append(number)
+        for index, frame in enumerate(film.frames()):
+            for number in numbers.get(index, ()):
+                image = frame[..., ::-1] if side == 0 and frame.ndim == 3 else frame
+                image = image if side == 0 else _one_channel(frame)
+                write_png(out / film.setting / f"{number:06d}.png", np.ascontiguousarray(image))
+    return (
+        f"{len(pairs)} pairs of {first_length} RGB frames ({rates[0]:g}/s) and {second_length} "
+        f"thermal frames ({rates[1]:g}/s); thermal began {offset_s:.2f} s later ({how})"
+    )
+
+
+def _grey(frame: Frame) -> Frame:
+    return gray_of(frame) if frame.ndim == 3 and frame.dtype == np.uint8 else frame
+
+
+def _one_channel(frame: Frame) -> Frame:
+    return gray_of(frame) if frame.ndim == 3 else frame

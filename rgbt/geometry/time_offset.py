@@ -1,0 +1,93 @@
+"""Estimate how much later one video began than another, by their motion, and pair their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# Width of the images whose differences are the motion, pixels.
+WIDTH = 64
+
+# Samples per second at which two motions are compared.
+RATE_HZ = 50.0
+
+# Least length in seconds that two motions have in common, and their least correlation.
+LEAST_S, LEAST_CORRELATION = 2.0, 0.5
+
+# An offset is told if no other one, farther than this, correlates within the margin.
+APART_S, MARGIN = 0.5, 0.1
+
+
+def small(frame: NDArray[Any]) -> NDArray[np.float32]:
+    """Shrink a grey frame (H, W) to `WIDTH` columns, float32."""
+    hw = WIDTH, max(1, round(WIDTH * frame.shape[0] / frame.shape[1]))
+    shrunk = cv2.resize(frame.astype(np.float32), hw, interpolation=cv2.INTER_AREA)
+    return np.asarray(shrunk, np.float32)
+
+
+def motion(frames: Sequence[NDArray[np.float32]]) -> Floats:
+    """Return the mean absolute difference of each frame to the one before; (T - 1,)."""
+    images = np.asarray(frames, np.float64)
+    return np.asarray(np.abs(np.diff(images, axis=0)).mean((1, 2)), np.float64)
+
+
+def offset_of(first: Floats, second: Floats, rates_hz: tuple[float, float]) -> float | None:
+    """Return how many seconds later the second video began; None if it cannot be told.
+
+    `first` and `second` are `motion` at frame rates `rates_hz`. The offset has the highest
+    correlation of both motions over the time in common, of offsets that leave `LEAST_S` seconds or
+    half of the shorter video.
+    """
+    series = [
+        np.interp(np.arange(0, len(values) / rate, 1 / RATE_HZ), _times(values, rate), values)
+        for values, rate in zip((first, second), rates_hz, strict=True)
+    ]
+    one, other = (np.log(values + 1e-3) for values in series)
+    least = int(max(LEAST_S * RATE_HZ, min(len(one), len(other)) / 2))
+    shifts = np.arange(least - len(other), len(one) - least + 1)
+    if not len(shifts):
+        return None
+    found = np.array([_correlation(one, other, int(shift)) for shift in shifts])
+    best = int(found.argmax())
+    others = found[np.abs(shifts - shifts[best]) > APART_S * RATE_HZ]
+    if found[best] < max(LEAST_CORRELATION, others.max(initial=-1.0) + MARGIN):
+        return None
+    return float(shifts[best]) / RATE_HZ
+
+
+def _times(values: Floats, rate_hz: float) -> Floats:
+    """Return the middle between the two frames of each difference, seconds."""
+    return np.asarray((np.arange(len(values)) + 0.5) / rate_hz, np.float64)
+
+
+def _correlation(one: Floats, other: Floats, shift: int) -> float:
+    """Correlate what two series have in common, the second one moved by `shift` samples."""
+    start, end = max(0, shift), min(len(one), len(other) + shift)
+    a, b = one[start:end], other[start - shift : end - shift]
+    if a.std() < 1e-6 or b.std() < 1e-6:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def paired(
+    numbers: tuple[int, int], rates_hz: tuple[float, float], offset_s: float
+) -> list[tuple[int, int]]:
+    """Pair frames of two videos of these lengths: (index, index) of the slower one's frames.
+
+    The partner is nearest in time, at most half a frame of the faster one away; the second video
+    began `offset_s` seconds later.
+    """
+    times = np.arange(numbers[0]) / rates_hz[0], np.arange(numbers[1]) / rates_hz[1] + offset_s
+    slow = 0 if rates_hz[0] <= rates_hz[1] else 1
+    pairs = []
+    for index, time in enumerate(times[slow]):
+        partner = int(np.abs(times[1 - slow] - time).argmin())
+        if abs(times[1 - slow][partner] - time) <= 0.5 / max(rates_hz) + 1e-9:
+            pairs.append((index, partner) if slow == 0 else (partner, index))
+    return pairs

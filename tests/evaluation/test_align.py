@@ -1,0 +1,193 @@
+"""`rgbt align`: images, labels, masks, lists and the data set file that it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbt.align import Options, main
+from rgbt.checks import InputError, RunError
+from rgbt.config.overrides import built
+from rgbt.data.check import check_dataset, misalignment
+from rgbt.data.file_dataset import FileDataset
+from tests.geometry.test_alignment import scene, thermal_of
+from tests.geometry.warps import drawn_warp, mean_error
+
+COMMON = (
+    "dataset=folder",
+    "dataset.num_classes=3",
+    "dataset.classes=[ground,car,person]",
+    "dataset.rgb='rgb/{name}.png'",
+    "dataset.thermal='ir/{name}.png'",
+    "dataset.label='gt/{name}.png'",
+    "dataset.shares={train: 0.5, val: 0.25, test: 0.25}",
+    "dataset.block=1",
+)
+WARP = drawn_warp(np.random.default_rng(8), scene(0))
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    """Eight pairs whose thermal image is warped by WARP; labels are drawn on RGB."""
+    root = tmp_path / "own"
+    for folder in ("rgb", "ir", "gt"):
+        (root / folder).mkdir(parents=True)
+    for number in range(8):
+        image = scene(number)
+        thermal = cv2.warpPerspective(
+            thermal_of(image, number), WARP, (160, 120), borderMode=cv2.BORDER_REFLECT
+        )
+        cv2.imwrite(str(root / f"rgb/{number}.png"), np.dstack([image] * 3))
+        cv2.imwrite(str(root / f"ir/{number}.png"), thermal)
+        cv2.imwrite(str(root / f"gt/{number}.png"), (image > 128).astype(np.uint8) * 2)
+    return [*COMMON, f"dataset.root={root}"]
+
+
+def written(out: Path, name: str) -> np.ndarray:
+    return np.asarray(cv2.imread(str(out / name), cv2.IMREAD_UNCHANGED))
+
+
+def aligned_set(out: Path, monkeypatch: pytest.MonkeyPatch) -> FileDataset:
+    monkeypatch.setenv("RGBT_CONF", str(out / "conf"))
+    dataset = built("dataset", ["dataset=aligned"])
+    assert isinstance(dataset, FileDataset)
+    return dataset
+
+
+def test_estimated_set_is_a_data_set(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    out = tmp_path / "aligned"
+    assert main(Options(out=out), words) == 0
+    said = capsys.readouterr().out
+    assert "estimated from 8 pairs, 0 outliers" in said
+    assert "ring 5" in said
+    stored = json.loads((out / "alignment.json").read_text())
+    assert mean_error(np.array(stored["H"]), WARP, scene(0)) < 0.4
+    before = built("dataset", words)
+    dataset = aligned_set(out, monkeypatch)
+    assert {s: dataset.names(s) for s in ("train", "val", "test")} == {
+        s: before.names(s) for s in ("train", "val", "test")
+    }
+    report = check_dataset(dataset)
+    assert report.problems == ()
+    assert misalignment(dataset, report) == ""
+    assert "px" in misalignment(before, check_dataset(before))
+    # RGB stays; a label counts where thermal saw the pixel too.
+    assert (written(out, "rgb/3.png") == written(tmp_path / "own", "rgb/3.png")).all()
+    valid, label = written(out, "valid/3.png"), written(out, "labels/3.png")
+    assert set(np.unique(valid)) == {0, 255}
+    expected = written(tmp_path / "own", "gt/3.png")
+    assert (label == np.where(valid == 255, expected, 255)).all()
+    sheet = written(out, "worst.png")
+    assert sheet.shape == (8 * 240, 4 * 320, 3)
+    # What alignment.yml holds gives the same images.
+    again = tmp_path / "again"
+    assert main(Options(out=again, matrix=out / "alignment.yml"), words) == 0
+    assert (written(again, "thermal/3.png") == written(out, "thermal/3.png")).all()
+
+
+def test_labels_of_thermal_move_to_rgb(words: list[str], tmp_path: Path) -> None:
+    """Thermal is 5 pixels to the right, and so are its labels."""
+    file = tmp_path / "points.csv"
+    file.write_text("x,y,u,v\n10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    out = tmp_path / "out"
+    assert main(Options(out=out, points=file, labels="thermal"), words) == 0
+    stored, label = written(tmp_path / "own", "gt/2.png"), written(out, "labels/2.png")
+    assert (label[:, :155] == stored[:, 5:]).all()
+    assert (label[:, 155:] == 255).all()
+    thermal = written(tmp_path / "own", "ir/2.png")
+    assert (written(out, "thermal/2.png")[:, :155] == thermal[:, 5:]).all()
+
+
+def test_thermal_stays_and_rgb_moves(words: list[str], tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    out = tmp_path / "out"
+    assert main(Options(out=out, points=file, onto="thermal"), words) == 0
+    own = tmp_path / "own"
+    assert (written(out, "thermal/2.png") == written(own, "ir/2.png")).all()
+    assert (written(out, "rgb/2.png")[:, 5:] == written(own, "rgb/2.png")[:, :-5]).all()
+    assert (written(out, "labels/2.png")[:, 5:] == written(own, "gt/2.png")[:, :-5]).all()
+    assert (written(out, "labels/2.png")[:, :5] == 255).all()
+
+
+def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
+    file, out = tmp_path / "file", tmp_path / "out"
+    for text, message in (
+        ("1,2,3,4\n", "expected four pairs or more"),
+        ("1,2,3,4\n1,2,3\n", "line 2: expected four numbers"),
+        ("1,2,3,4\n1,2,3,inf\n", "line 2: expected four numbers"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=message):
+            main(Options(out=out, points=file), words)
+    for text, message in (("not yaml [", "no YAML"), ("%YAML:1.0\n---\na: 1\n", "'K_rgb'")):
+        file.write_text(text)
+        with pytest.raises(InputError, match=message):
+            main(Options(out=out, matrix=file), words)
+    with pytest.raises(InputError, match="either dataset"):
+        main(Options(out=out), [])
+    with pytest.raises(InputError, match="holds the input images"):
+        main(Options(out=tmp_path / "own"), words)
+    assert not out.exists()
+
+
+def test_night_without_edges_is_not_told(words: list[str], tmp_path: Path) -> None:
+    for file in (tmp_path / "own/ir").iterdir():
+        cv2.imwrite(str(file), np.full((120, 160), 9, np.uint8))
+    with pytest.raises(RunError, match="cannot be told from 8 pairs"):
+        main(Options(out=tmp_path / "out"), words)
+    dataset = built("dataset", words)
+    assert misalignment(dataset, check_dataset(dataset)).startswith("alignment: cannot be told")
+
+
+def folder_of_frames(folder: Path, places: np.ndarray) -> None:
+    """A bright square of 8 pixels at these columns."""
+    folder.mkdir()
+    for number, place in enumerate(places):
+        image = np.zeros((48, 96), np.uint8)
+        cv2.rectangle(image, (int(place), 20), (int(place) + 8, 28), 255, -1)
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+
+
+def test_two_videos_are_paired_by_motion(tmp_path: Path, capsys: Any) -> None:
+    """RGB at 10 frames a second, thermal at 5; thermal began 1 s later."""
+    steps = np.random.default_rng(2).integers(0, 6, 200)
+    path = np.abs(np.cumsum(steps) % 160 - 80)  # forth and back
+    folder_of_frames(tmp_path / "a", path[:100])
+    folder_of_frames(tmp_path / "b", path[10:90:2])
+    out = tmp_path / "out"
+    given = Options(out=out, rgb=tmp_path / "a", thermal=tmp_path / "b", rgb_fps=10, thermal_fps=5)
+    assert main(given, []) == 0
+    said = capsys.readouterr().out
+    assert "thermal began 1.0" in said
+    assert "40 pairs of 100 RGB frames" in said
+    for number in (0, 17, 39):
+        rgb, thermal = (written(out, f"{kind}/{number:06d}.png") for kind in ("rgb", "thermal"))
+        assert (rgb == thermal).all()
+    dataset = built(
+        "dataset",
+        [
+            "dataset=video",
+            f"dataset.root={out}",
+            "dataset.rgb='rgb/{name}.png'",
+            "dataset.thermal='thermal/{name}.png'",
+            "dataset.label=null",
+        ],
+    )
+    assert len(dataset.names("test")) == 40
+
+
+def test_video_that_names_other_files_is_not_opened(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    film.write_text("#EXTM3U\nhttp://127.0.0.1/a.ts\n")
+    with pytest.raises(InputError, match="expected a video in MP4"):
+        main(Options(out=tmp_path / "out", rgb=film, thermal=film), [])
+    with pytest.raises(InputError, match="rgb_fps has no value"):
+        main(Options(out=tmp_path / "out", rgb=tmp_path, thermal=film), [])
