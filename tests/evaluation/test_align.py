@@ -117,6 +117,25 @@ def test_thermal_stays_and_rgb_moves(words: list[str], tmp_path: Path) -> None:
     assert (written(out, "labels/2.png")[:, :5] == 255).all()
 
 
+@pytest.mark.parametrize("unit", ["centikelvin", [0.01, -273.15]])
+def test_unit_and_range_of_thermal_are_kept(
+    unit: Any, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, out, file = tmp_path / "own", tmp_path / "out", tmp_path / "points.csv"
+    for path in (own / "ir").iterdir():  # 10 to 35.5 degrees
+        stored = written(own, f"ir/{path.name}").astype(np.uint16) * 10 + 28315
+        cv2.imwrite(str(path), stored)
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    setting = f"dataset.thermal_range={{unit: {unit}, range: [12, 30]}}"
+    assert main(Options(out=out, points=file), [*words, setting]) == 0
+    before, dataset = built("dataset", [*words, setting]), aligned_set(out, monkeypatch)
+    assert dataset.images.unit == before.images.unit
+    assert dataset.images.limits == before.images.limits == pytest.approx((28515, 30315))
+    name = before.names("test")[0]
+    moved, own_levels = dataset.read(name).thermal, before.read(name).thermal
+    assert (moved[:, :155] == own_levels[:, 5:]).all()
+
+
 def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
     file, out = tmp_path / "file", tmp_path / "out"
     for text, message in (
