@@ -221,9 +221,9 @@ def class_remarks(counts: Counts) -> list[str]:
             "The classes seem to have other indices than those of the data set: predictions fit "
             f"the labels better with {', '.join(fits)}."
         )
-    absent = np.flatnonzero((labelled > 0) & (predicted == 0) & counts.scored).tolist()
-    if absent:
-        names = ", ".join(counts.classes[label] for label in absent)
+    unpredicted = np.flatnonzero((labelled > 0) & (predicted == 0) & counts.scored).tolist()
+    if unpredicted:
+        names = ", ".join(counts.classes[label] for label in unpredicted)
         remarks.append(f"No prediction holds these classes of the labels: {names}.")
     return remarks
 
