@@ -1,7 +1,7 @@
 """Align RGB and thermal images of one rig: ``rgbt align dataset=mine out=aligned``.
 
 It writes images that show the same pixels, their labels, and pictures to judge by. Exit code 1: the
-alignment cannot be told.
+alignment cannot be estimated.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def misalignment(dataset: FileDataset, report: DatasetReport) -> str:
                 pairs.append((gray_of(sample.rgb), sample.thermal))
     found = estimated(pairs) if pairs else None
     if found is None or found.reason((hw[0], hw[1])):
-        return f"alignment: cannot be told from {len(pairs)} pairs."
+        return f"alignment: cannot be estimated from {len(pairs)} pairs."
     points = grid_of((hw[0], hw[1]), GRID)
     shifts = np.linalg.norm(moved(found.matrix, points) - points, axis=1).reshape(GRID, GRID)
     middle = GRID // 2

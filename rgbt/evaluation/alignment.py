@@ -146,7 +146,7 @@ def from_points(path: Path) -> Alignment:
 
 
 def from_pairs(dataset: FileDataset, names: Sequence[str]) -> Alignment:
-    """Estimate the homography from pairs; RunError if it cannot be told, and why."""
+    """Estimate the homography from pairs; RunError if it cannot be estimated, and why."""
     pairs: list[tuple[Pixels, Pixels]] = []
     for name in names:
         rgb, thermal = read_unaligned(dataset, name)
@@ -157,8 +157,8 @@ def from_pairs(dataset: FileDataset, names: Sequence[str]) -> Alignment:
     why = "no tile has edges in both" if found is None else found.reason(pairs[0][0].shape)
     if found is None or why:
         raise RunError(
-            f"the alignment cannot be told from {len(names)} pairs: {why}. Give more pairs by day "
-            "(pairs=...), or points=FILE, or matrix=FILE."
+            f"the alignment cannot be estimated from {len(names)} pairs: {why}. Give more pairs by "
+            "day (pairs=...), or points=FILE, or matrix=FILE."
         )
     return found
 

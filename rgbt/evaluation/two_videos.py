@@ -74,7 +74,7 @@ def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> 
 
     Raises:
         InputError: a video cannot be read, or no two frames are of one time.
-        RunError: the offset cannot be told.
+        RunError: the offset cannot be estimated.
     """
     thumbnails = [[small(_grey(frame)) for frame in film.frames()] for film in (rgb, thermal)]
     for film, frames in zip((rgb, thermal), thumbnails, strict=True):
@@ -86,8 +86,8 @@ def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> 
         offset_s, how = offset_of(first, second, rates), "estimated by motion"
     if offset_s is None:
         raise RunError(
-            "the offset cannot be told from the motion of both videos: too short, still, or of "
-            "even motion. Give offset_s=SECONDS, how much later the thermal video began."
+            "the offset cannot be estimated from the motion of both videos: too short, still, or "
+            "of even motion. Give offset_s=SECONDS, how much later the thermal video began."
         )
     first_length, second_length = map(len, thumbnails)
     pairs = paired((first_length, second_length), rates, offset_s)

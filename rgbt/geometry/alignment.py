@@ -47,7 +47,7 @@ NEAR = 1.5
 # A pair is an outlier if it is shifted by more against the others, in the same pixels.
 APART = 2.0
 
-# An estimate is told if so many tiles agree, and its uncertainty is at most this share of the
+# An estimate is used if so many tiles agree, and its uncertainty is at most this share of the
 # diagonal: 1.5 pixels of 640 x 480.
 LEAST_SHARE, MOST_UNCERTAIN = 0.75, 1.5 / 800
 

@@ -20,7 +20,7 @@ RATE_HZ = 50.0
 # Least length in seconds that two motions have in common, and their least correlation.
 LEAST_S, LEAST_CORRELATION = 2.0, 0.5
 
-# An offset is told if no other one, farther than this, correlates within the margin.
+# An offset is estimated if no other one, farther than this, correlates within the margin.
 APART_S, MARGIN = 0.5, 0.1
 
 
@@ -38,7 +38,7 @@ def motion(frames: Sequence[NDArray[np.float32]]) -> Floats:
 
 
 def offset_of(first: Floats, second: Floats, rates_hz: tuple[float, float]) -> float | None:
-    """Return how many seconds later the second video began; None if it cannot be told.
+    """Return how many seconds later the second video began; None if it cannot be estimated.
 
     `first` and `second` are `motion` at frame rates `rates_hz`. The offset has the highest
     correlation of both motions over the time in common, of offsets that leave `LEAST_S` seconds or

@@ -67,9 +67,7 @@ def trials(what: str, groups: list[Pairs], limit: float, own: list[Matrix | None
 
 
 def main() -> None:
-    print(
-        "| pairs | trials | within | beyond | cannot be told | error |\n|---|---|---|---|---|---|"
-    )
+    print("| pairs | trials | within | beyond | no estimate | error |\n|---|---|---|---|---|---|")
     for time, pairs in read(["dataset=synth", "dataset.num_test=60"], "test", 10).items():
         same: list[Matrix | None] = [np.eye(3)] * 10
         trials(f"embedded {time}, one scene, 0.5 px", [[pair] for pair in pairs], 0.5, same)

@@ -160,10 +160,12 @@ def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
 def test_night_without_edges_is_not_told(words: list[str], tmp_path: Path) -> None:
     for file in (tmp_path / "own/ir").iterdir():
         cv2.imwrite(str(file), np.full((120, 160), 9, np.uint8))
-    with pytest.raises(RunError, match="cannot be told from 8 pairs"):
+    with pytest.raises(RunError, match="cannot be estimated from 8 pairs"):
         main(Options(out=tmp_path / "out"), words)
     dataset = built("dataset", words)
-    assert misalignment(dataset, check_dataset(dataset)).startswith("alignment: cannot be told")
+    assert misalignment(dataset, check_dataset(dataset)).startswith(
+        "alignment: cannot be estimated"
+    )
 
 
 def folder_of_frames(folder: Path, places: np.ndarray) -> None:
