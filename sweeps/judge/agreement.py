@@ -115,27 +115,30 @@ def rank_correlations(scores: Values, printed: Values) -> Values:
 
 
 def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
-    """Return the contrasts of all claims about differences whose printed values are known.
+    """Return the contrasts of all claims about differences.
 
     Returns:
-        a row for each contrast of different runs, with the columns `CONTRASTS`: decides says
-        whether its numbers are those of the verdict of the claim; NaN and 0 where it was not
-        explored, or not confirmed.
+        a row for each contrast of different runs, with the columns `CONTRASTS`: printed is NaN
+        where no paper prints both values; decides says whether its numbers are those of the
+        verdict of the claim; NaN and 0 where it was not explored, or not confirmed.
     """
     import pandas as pd
 
     rows: dict[Scores, dict[str, Any]] = {}
-    for judged in tables:
-        for claim in judged.claims:
-            if not claim.is_level:
-                _add_contrasts(claim, rows)
-    return pd.DataFrame(list(rows.values()), columns=CONTRASTS)
+    claims = [claim for judged in tables for claim in judged.claims if not claim.is_level]
+    for is_printed in (True, False):  # of two names of one contrast the printed one is kept
+        for claim in claims:
+            _add_contrasts(claim, rows, is_printed=is_printed)
+    frame = pd.DataFrame(list(rows.values()), columns=CONTRASTS)
+    return frame.astype({"printed": float})
 
 
-def _add_contrasts(claim: JudgedClaim, rows: dict[Scores, dict[str, Any]]) -> None:
+def _add_contrasts(
+    claim: JudgedClaim, rows: dict[Scores, dict[str, Any]], *, is_printed: bool
+) -> None:
     """Add the contrasts of a claim, by their scores; one that is known may decide this claim."""
     for single in claim.contrasts:
-        if single.printed is None:
+        if (single.printed is not None) != is_printed:
             continue
         opposite = negated(single.scores)
         place = opposite if opposite in rows else single.scores
@@ -171,6 +174,8 @@ def _numbers(verdict: Verdict | None) -> tuple[float, float, float, int]:
 def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     """Count signs as printed among contrasts (`contrasts_frame`), by kind of images and scale.
 
+    Contrasts without printed values do not count.
+
     Returns:
         the columns `SIGNS`: alike of so many contrasts have the printed sign; low and high are the
         ends of the 95 % interval of the share, with tables drawn anew, because the contrasts of a
@@ -183,7 +188,7 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     for (images, scale), group in contrasts.groupby(["images", "scale"], sort=True):
         ours = ours_of(group)
         low, high = ends_of(group)
-        known = ours.notna() & (group["printed"] != 0)
+        known = ours.notna() & group["printed"].notna() & (group["printed"] != 0)
         alike = known & (ours * group["printed"] > 0)
         decided = known & ((low > 0) | (high < 0))
         if not known.any():

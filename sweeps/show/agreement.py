@@ -28,11 +28,14 @@ def signs_in_words(signs: pd.DataFrame) -> list[str]:
         share = f"{100 * found['alike'] / found['contrasts']:.0f} %"
         if not math.isnan(found["low"]):
             share += f" [{100 * found['low']:.0f}, {100 * found['high']:.0f}]"
+        decided = "no interval excludes 0"
+        if found["decided"]:
+            alike = f"{found['decided_alike']} of {found['decided']}"
+            decided = f"of those whose interval excludes 0, {alike}"
         sentences.append(
             f"on {found['images']} at scale={found['scale']}, {found['alike']} of "
             f"{found['contrasts']} contrasts have the printed sign, {share}, where chance gives "
-            f"50 %; of those whose interval excludes 0, {found['decided_alike']} of "
-            f"{found['decided']}"
+            f"50 %; {decided}"
         )
     return sentences
 
@@ -74,7 +77,8 @@ def signs_grid(contrasts: pd.DataFrame) -> TextTable:
     """Count the contrasts of each table whose sign is the printed one."""
     ours = ours_of(contrasts)
     frame = contrasts.assign(alike=ours * contrasts["printed"] > 0, ours=ours)
-    frame = frame[frame["ours"].notna() & (frame["printed"] != 0)]
+    frame = frame.dropna(subset=["ours", "printed"])
+    frame = frame[frame["printed"] != 0]
     rows = []
     for (table, images, scale), own in frame.groupby(["table", "images", "scale"], sort=True):
         confirmed = str(own["confirmed"].notna().sum())
@@ -114,7 +118,8 @@ def sides_grid(contrasts: pd.DataFrame, beside: str) -> TextTable:
         if not own["kind"].str.startswith(beside).any():
             continue
         by_kind = {row["kind"]: _side(row) for _, row in own.iterrows()}
-        printed = f"{own['printed'].iloc[0]:+.2f}"
+        value = own["printed"].iloc[0]
+        printed = ABSENT if math.isnan(value) else f"{value:+.2f}"
         cells = [by_kind.get(kind, ABSENT) for kind in kinds]
         rows.append((f"{table}: {contrast}", printed, *cells))
     return TextTable("", ("contrast", PRINT, *kinds), tuple(rows))
@@ -129,7 +134,7 @@ def _side(row: pd.Series) -> str:
 
 
 def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
-    """Draw the contrast that decides each claim: printed hollow, explored pale, confirmed full.
+    """Draw the contrast that decides each claim: print hollow, explored pale, confirmed full.
 
     Those that disagree most with print are on top. `contrasts` is that of
     `sweeps.judge.agreement.contrasts_frame`; None where nothing is to be drawn.
@@ -137,7 +142,7 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
     from analysis.figures.plots import new_figure
 
     ours = ours_of(contrasts)
-    frame = contrasts.assign(ours=ours)[contrasts["decides"] & ours.notna()]
+    frame = contrasts.assign(ours=ours)[contrasts["decides"]].dropna(subset=["ours", "printed"])
     if frame.empty:
         return None
     # Of a printed gain and a loss of ours the gap is relative to the printed size.

@@ -254,7 +254,7 @@ class Report:
     def _number(self, mark: str) -> str:
         """What a mark names."""
         if mark == "signs":
-            return " ".join(signs_in_words(signs_of(self.contrasts)))
+            return "; ".join(signs_in_words(signs_of(self.contrasts)))
         if mark == "count runs":
             return str(len(self.runs))
         if mark == "count":

@@ -36,11 +36,12 @@ PRINTED = {"a": 50.0, "b": 53.0, "c": 52.0, "d": 52.0}
 
 
 def made(name: str, shares: dict[str, tuple[float, ...]]) -> JudgedTable:
-    """A table whose printed order is a, c or d, b."""
-    last = list(shares)[-1]
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"mIoU": PRINTED[label]}) for label in shares
-    )
+    """A table whose printed order is a, c or d, b; no paper prints other rows."""
+    a, b, *_, last = shares
+    rows = []
+    for label in shares:
+        values = {"mIoU": PRINTED[label]} if label in PRINTED else {}
+        rows.append(Row(label=label, experiment="crm", values=values))
     claims = tuple(
         Claim(
             name=f"{row} above {other}",
@@ -51,10 +52,10 @@ def made(name: str, shares: dict[str, tuple[float, ...]]) -> JudgedTable:
             columns=("mIoU",),
             expected="higher",
         )
-        for row, other in (("b", "a"), ("a", "b"), ("b", last), (last, "a"))
+        for row, other in ((b, a), (a, b), (b, last), (last, a))
     )
     column = Column(name="mIoU", metric="mIoU")
-    given = table(rows, (column,), claims=claims, confirm=(0, 1, 2))
+    given = table(tuple(rows), (column,), claims=claims, confirm=(0, 1, 2))
     return judged(given, planted(shares), name=name)
 
 
@@ -100,6 +101,29 @@ def test_signs_of_different_contrasts_are_counted_once() -> None:
     lines = agreement_lines(signs_of(both), ranks_of([first]))
     assert "contrasts have the printed sign" in lines[0]
     assert "0 below" in lines[0]
+
+
+def test_contrasts_without_print_are_known_and_do_not_count_as_printed() -> None:
+    printed = made("p/one", SHARES)
+    own = made("own", dict(zip("xyz", SHARES.values(), strict=True)))
+    for tables in ([printed, own], [own, printed]):
+        contrasts = contrasts_frame(tables)
+        assert contrasts["printed"].notna().tolist() == [True] * 3 + [False] * 3
+        (found,) = signs_of(contrasts).to_dict("records")
+        assert (found["alike"], found["contrasts"]) == (2, 3)
+        assert "| own |" not in signs_grid(contrasts).to_markdown()
+        figure = forest_of(contrasts, "P")
+        assert figure is not None
+        assert len(figure.axes[0].get_yticklabels()) == 3
+        sides = sides_grid(contrasts, "unknown").to_markdown()
+        assert "| own: y - x, mIoU | - | +9.67*" in sides
+
+
+def test_no_interval_that_excludes_0_is_said() -> None:
+    both = contrasts_frame([made("p/one", SHARES)])
+    wide = both.assign(confirmed_low=-99.0, confirmed_high=99.0)
+    (line,) = agreement_lines(signs_of(wide), ranks_of([]))
+    assert line.endswith("where chance gives 50 %; no interval excludes 0.")
 
 
 def test_a_confirmation_without_interval_is_not_decided_by_exploration() -> None:
