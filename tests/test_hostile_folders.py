@@ -170,3 +170,12 @@ def test_images_are_written_inside_the_folder_that_is_named(
     code, _, err = call(predict.entry, *words)
     assert (code, "leads out of" in err) == (2, True), err
     assert not (tmp_path / "stranger").exists()
+
+
+def test_a_file_that_another_process_removes_is_no_pipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkpoint of a run that goes on: it was there when the folder was listed."""
+    monkeypatch.setattr(os, "walk", lambda folder: [(str(folder), [], ["next_5"])])
+    monkeypatch.setattr(Path, "exists", lambda _: True)  # and a moment later, but then not
+    check_links(tmp_path)

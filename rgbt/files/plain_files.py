@@ -6,8 +6,10 @@ import hashlib
 import json
 import os
 import re
+import stat
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -42,8 +44,11 @@ def check_links(folder: Path) -> None:
         for path in (Path(place, name) for name in (*folders, *files)):
             if path.is_symlink():
                 inside(path, folder)
-            elif path.exists() and not (path.is_file() or path.is_dir()):  # or it was just removed
-                raise InputError(f"{path} is not a regular file; remove it.")
+                continue
+            with suppress(FileNotFoundError):  # another process just removed it
+                mode = path.stat().st_mode  # once: it may be removed between two questions
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    raise InputError(f"{path} is not a regular file; remove it.")
 
 
 def inside(path: Path, folder: Path) -> Path:

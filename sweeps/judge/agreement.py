@@ -130,7 +130,7 @@ def contrasts_frame(tables: Sequence[JudgedTable]) -> pd.DataFrame:
         for claim in claims:
             _add_contrasts(claim, rows, is_printed=is_printed)
     frame = pd.DataFrame(list(rows.values()), columns=CONTRASTS)
-    return frame.astype({"printed": float})
+    return frame.astype({"printed": float, "decides": bool})
 
 
 def _add_contrasts(

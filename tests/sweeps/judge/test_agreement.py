@@ -152,6 +152,7 @@ def test_agreement_is_shown_and_drawn() -> None:
     assert names[0] == "one: b - c, mIoU", "the sign that differs from print is on top"
     assert len(names) == 3
     assert forest_of(contrasts.iloc[:0], "P") is None
+    assert forest_of(contrasts_frame([]), "P") is None
 
 
 def measured(kind: str, scale: str, ours: dict[str, float]) -> pd.DataFrame:

@@ -30,7 +30,7 @@ from tests.commands import Call
 from tests.models.external.standins import STACKED, write_checkout
 from tests.sweeps.show.planted import plant
 
-PAPERS = ("crm", "multihead", "spatialseg", "temporal")
+PAPERS = ("crm", "field", "multihead", "spatialseg", "temporal")
 
 OWN = """
 paper: my
