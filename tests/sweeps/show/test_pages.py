@@ -30,7 +30,7 @@ from tests.commands import Call
 from tests.models.external.standins import STACKED, write_checkout
 from tests.sweeps.show.planted import plant
 
-PAPERS = ("crm", "field", "multihead", "spatialseg", "temporal")
+PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
 OWN = """
 paper: my
@@ -361,6 +361,7 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
             "claims",
             "agreement",
             "real-images",
+            "field",
             "networks",
             "studies",
             "my",
