@@ -9,7 +9,6 @@ import re
 import stat
 import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -44,11 +43,17 @@ def check_links(folder: Path) -> None:
         for path in (Path(place, name) for name in (*folders, *files)):
             if path.is_symlink():
                 inside(path, folder)
-                continue
-            with suppress(FileNotFoundError):  # another process just removed it
-                mode = path.stat().st_mode  # once: it may be removed between two questions
-                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                    raise InputError(f"{path} is not a regular file; remove it.")
+            elif _is_special(path):
+                raise InputError(f"{path} is not a regular file; remove it.")
+
+
+def _is_special(path: Path) -> bool:
+    """Ask once whether it is a pipe or device: another process may remove it meanwhile."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def inside(path: Path, folder: Path) -> Path:
