@@ -28,6 +28,8 @@ def confirming(tables: Iterable[JudgedTable]) -> list[tuple[Path, Table, Claim, 
                 continue
             for label in claim.rows:
                 for seed in table.confirm:
+                    if (label, seed) not in judged.runs:  # a claim covers the rows that were run
+                        continue
                     (run,) = judged.runs[label, seed].results
                     found.append((path, table, claim.claim, run))
     return found
