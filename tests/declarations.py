@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 import yaml
@@ -26,12 +27,10 @@ def confirming(tables: Iterable[JudgedTable]) -> list[tuple[Path, Table, Claim, 
         for claim in judged.claims:
             if claim.basis != "confirmation":
                 continue
-            for label in claim.rows:
-                for seed in table.confirm:
-                    if (label, seed) not in judged.runs:  # a claim covers the rows that were run
-                        continue
-                    (run,) = judged.runs[label, seed].results
-                    found.append((path, table, claim.claim, run))
+            cells = set(product(claim.rows, table.confirm))
+            for cell in cells & judged.runs.keys():  # a claim covers the rows that were run
+                (run,) = judged.runs[cell].results
+                found.append((path, table, claim.claim, run))
     return found
 
 

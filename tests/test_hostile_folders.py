@@ -175,7 +175,7 @@ def test_images_are_written_inside_the_folder_that_is_named(
 def test_a_file_that_another_process_removes_is_no_pipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A checkpoint of a run that goes on: it was there when the folder was listed."""
+    """A checkpoint of a run that continues: it was there when the folder was listed."""
     monkeypatch.setattr(os, "walk", lambda folder: [(str(folder), [], ["next_5"])])
     monkeypatch.setattr(Path, "exists", lambda _: True)  # and a moment later, but then not
     check_links(tmp_path)

@@ -30,7 +30,7 @@ from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.images import PairReader
 from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
-from rgbt.geometry.alignment import GRID, estimated, grid_of, moved
+from rgbt.geometry.alignment import GRID, estimated, grid_of, moved, root_mean_square, sampled
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
@@ -123,9 +123,9 @@ def misalignment(dataset: FileDataset, report: DatasetReport) -> str:
     if not sizes or min(hw := sizes.most_common(1)[0][0]) < SMALLEST_ALIGNED:
         return ""
     pairs = []
-    for index in np.linspace(0, len(names) - 1, min(len(names), ALIGNED_PAIRS)).astype(int):
+    for name in sampled(names, ALIGNED_PAIRS):
         with suppress(InputError):  # it is among the problems
-            sample = dataset.pair(names[index])
+            sample = dataset.pair(name)
             if sample.thermal.shape == hw:
                 pairs.append((gray_of(sample.rgb), sample.thermal))
     found = estimated(pairs) if pairs else None
@@ -134,18 +134,16 @@ def misalignment(dataset: FileDataset, report: DatasetReport) -> str:
     points = grid_of((hw[0], hw[1]), GRID)
     shifts = np.linalg.norm(moved(found.matrix, points) - points, axis=1).reshape(GRID, GRID)
     middle = GRID // 2
-    sides: dict[str, Any] = {
-        "right": np.s_[:, -1],
-        "left": np.s_[:, 0],
-        "top": np.s_[0],
-        "bottom": np.s_[-1],
+    places: dict[str, Any] = {
+        "at the right edge": np.s_[:, -1],
+        "at the left edge": np.s_[:, 0],
+        "at the top edge": np.s_[0],
+        "at the bottom edge": np.s_[-1],
+        "in the middle": np.s_[middle, middle],
     }
-    places = {f"at the {side} edge": where for side, where in sides.items()}
-    places["in the middle"] = np.s_[middle, middle]
-    place, off = max(
-        ((p, float(shifts[at].mean())) for p, at in places.items()), key=lambda x: x[1]
-    )
-    error = float(np.sqrt(np.square(found.uncertainty[places[place]]).mean()))
+    means = {place: float(shifts[where].mean()) for place, where in places.items()}
+    place = max(means, key=means.__getitem__)
+    off, error = means[place], root_mean_square(found.uncertainty[places[place]])
     if off <= max(ALIGNED_PX, 2 * error):
         return ""
     return (

@@ -30,6 +30,7 @@ from rgbt.geometry.alignment import (
     moved,
     resizing,
     root_mean_square,
+    sampled,
 )
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.geometry.rig import CALIBRATION, Rig, maps_of, of_calibration, of_homography, resampled
@@ -91,11 +92,6 @@ def align(
 def read_unaligned(dataset: FileDataset, name: str) -> tuple[Pixels, Pixels]:
     """Read whole RGB (H, W, 3) and thermal values (H', W'); InputError as `FileDataset.read`."""
     return dataset.images.unaligned(*dataset.frame(name)[2:4])
-
-
-def sampled(names: Sequence[str], number: int) -> list[str]:
-    """Take at most `number` names at even distances."""
-    return [names[i] for i in np.linspace(0, len(names) - 1, min(number, len(names))).astype(int)]
 
 
 def read_rig(path: Path) -> tuple[Rig, Floats | None]:

@@ -76,10 +76,12 @@ def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> 
         InputError: a video cannot be read, or no two frames are of one time.
         RunError: the offset cannot be estimated.
     """
-    thumbnails = [[small(_grey(frame)) for frame in film.frames()] for film in (rgb, thermal)]
-    for film, frames in zip((rgb, thermal), thumbnails, strict=True):
+    thumbnails = []
+    for film in (rgb, thermal):
+        frames = [small(_one_channel(frame)) for frame in film.frames()]
         if len(frames) < 2:
             raise InputError(f"{film.setting}={film.path}: {len(frames)} frames can be read.")
+        thumbnails.append(frames)
     rates, how = (rgb.rate_hz, thermal.rate_hz), "given"
     if offset_s is None:
         first, second = (motion(frames) for frames in thumbnails)
@@ -99,8 +101,7 @@ def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> 
             numbers.setdefault(pair[side], []).append(number)
         for index, frame in enumerate(film.frames()):
             for number in numbers.get(index, ()):
-                image = frame[..., ::-1] if side == 0 and frame.ndim == 3 else frame
-                image = image if side == 0 else _one_channel(frame)
+                image = _one_channel(frame) if side else _for_opencv(frame)
                 write_png(out / film.setting / f"{number:06d}.png", np.ascontiguousarray(image))
     return (
         f"{len(pairs)} pairs of {first_length} RGB frames ({rates[0]:g}/s) and {second_length} "
@@ -108,9 +109,9 @@ def pair_videos(rgb: Film, thermal: Film, offset_s: float | None, out: Path) -> 
     )
 
 
-def _grey(frame: Frame) -> Frame:
-    return gray_of(frame) if frame.ndim == 3 and frame.dtype == np.uint8 else frame
+def _for_opencv(frame: Frame) -> Frame:
+    return frame[..., ::-1] if frame.ndim == 3 else frame
 
 
 def _one_channel(frame: Frame) -> Frame:
-    return gray_of(frame) if frame.ndim == 3 else frame
+    return gray_of(frame) if frame.ndim == 3 else frame  # of three channels all have 8 bits

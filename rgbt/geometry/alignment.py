@@ -97,6 +97,11 @@ class Alignment:
         return ""
 
 
+def sampled(names: Sequence[str], number: int) -> list[str]:
+    """Take at most `number` names at even distances."""
+    return [names[i] for i in np.linspace(0, len(names) - 1, min(number, len(names))).astype(int)]
+
+
 def root_mean_square(values: Floats) -> float:
     """Return the root of the mean of squares."""
     return float(np.sqrt(np.mean(np.square(values))))

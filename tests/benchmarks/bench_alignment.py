@@ -36,14 +36,14 @@ def read(words: Sequence[str], split: str, number: int | None = None) -> dict[st
     }
 
 
-def told(found: Alignment | None, image: Image) -> bool:
+def is_used(found: Alignment | None, image: Image) -> bool:
     return found is not None and not found.reason(inner(image).shape)
 
 
 def native(pairs: Pairs) -> Matrix | None:
-    """The alignment of pairs as they are, None if it is not told."""
+    """The alignment of pairs as they are, None if it is not used."""
     found = estimated([(inner(rgb), inner(thermal)) for rgb, thermal in pairs])
-    return found.matrix if found is not None and told(found, pairs[0][0]) else None
+    return found.matrix if found is not None and is_used(found, pairs[0][0]) else None
 
 
 def trials(what: str, groups: list[Pairs], limit: float, own: list[Matrix | None]) -> None:
@@ -54,7 +54,7 @@ def trials(what: str, groups: list[Pairs], limit: float, own: list[Matrix | None
         image = pairs[0][0]
         warp = drawn_warp(generator, image)
         found = estimated([(inner(rgb), warped(thermal, warp)) for rgb, thermal in pairs])
-        if found is None or before is None or not told(found, image):
+        if found is None or before is None or not is_used(found, image):
             silent += 1
         else:
             errors.append(mean_error(found.matrix, warp @ before, image))

@@ -157,7 +157,7 @@ def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_night_without_edges_is_not_told(words: list[str], tmp_path: Path) -> None:
+def test_night_without_edges_is_not_estimated(words: list[str], tmp_path: Path) -> None:
     for file in (tmp_path / "own/ir").iterdir():
         cv2.imwrite(str(file), np.full((120, 160), 9, np.uint8))
     with pytest.raises(RunError, match="cannot be estimated from 8 pairs"):

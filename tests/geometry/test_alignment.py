@@ -101,7 +101,7 @@ def flat(image: Image, _: np.random.Generator) -> Image:
 
 
 @pytest.mark.parametrize("thermal", [noise, flat])
-def test_without_common_edges_nothing_is_told(
+def test_without_common_edges_nothing_is_estimated(
     pairs: list[tuple[Image, Image]], thermal: Any
 ) -> None:
     rng = np.random.default_rng(0)
@@ -143,16 +143,16 @@ def test_embedded_scenes(time: str, least: int) -> None:
     """Of ten scenes each alone, so many are within 0.5 pixels; no wrong one by more than 1."""
     dataset = built("dataset", ["dataset=synth", "dataset.num_test=60"])
     names = [name for name in dataset.names("test") if name.endswith(time)][:10]
-    rng, told = np.random.default_rng(62), []
+    rng, errors = np.random.default_rng(62), []
     samples = [dataset.pair(name) for name in names]
     images = [(gray_of(sample.rgb), sample.thermal) for sample in samples]
     for rgb, thermal in images:
         warp = drawn_warp(rng, rgb)
         found = estimated([(inner(rgb), warped(thermal, warp))])
         if found is not None and not found.reason(inner(rgb).shape):
-            told.append(mean_error(found.matrix, warp, rgb))
-    assert sum(error < 0.5 for error in told) >= least
-    assert max(told) < 1
+            errors.append(mean_error(found.matrix, warp, rgb))
+    assert sum(error < 0.5 for error in errors) >= least
+    assert max(errors) < 1
     warp = drawn_warp(rng, images[0][0])
     rig = estimated([(inner(rgb), warped(thermal, warp)) for rgb, thermal in images])
     assert rig is not None
