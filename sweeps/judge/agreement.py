@@ -40,7 +40,8 @@ CONTRASTS = [
 CONTRASTS += ["explored_high", "explored_seeds", "confirmed", "confirmed_low", "confirmed_high"]
 CONTRASTS += ["confirmed_seeds"]
 
-PAIRS = ["first", "second", "alike", "contrasts", "low", "high", "rho", "rho_low", "rho_high"]
+PAIRS = ["first", "second", "alike", "contrasts", "tables", "low", "high"]
+PAIRS += ["rho", "rho_low", "rho_high"]
 PRINT = "print"
 
 SIGNS = ["images", "scale", "alike", "contrasts", "low", "high", "decided_alike", "decided"]
@@ -217,9 +218,9 @@ def pairs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         the columns `PAIRS`, a row for each pair of `PRINT` and `kinds_of`: alike of so many
-        contrasts have the same sign; rho is Spearman's correlation of the differences; low, high,
-        rho_low and rho_high are ends of 95 % intervals, with whole tables drawn anew (NaN for one
-        table).
+        contrasts of so many tables have the same sign; rho is Spearman's correlation of the
+        differences; low, high, rho_low and rho_high are ends of 95 % intervals, with whole tables
+        drawn anew (NaN for one table).
     """
     import pandas as pd
 
@@ -237,7 +238,7 @@ def pairs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
         parts = [part.to_numpy() for _, part in both.groupby(tables)]
         alike = [int((part[:, 0] * part[:, 1] > 0).sum()) for part in parts]
         ends = _share_interval(np.array(alike), np.array([len(part) for part in parts]))
-        every = (sum(alike), len(both), *ends, *_rho_interval(parts))
+        every = (sum(alike), len(both), len(parts), *ends, *_rho_interval(parts))
         found.append((first, second, *every))
     return pd.DataFrame(found, columns=PAIRS)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable
@@ -97,8 +98,9 @@ def pairs_grid(pairs: pd.DataFrame) -> TextTable:
             share += f" [{100 * row['low']:.0f}, {100 * row['high']:.0f}]"
             rho += f" [{row['rho_low']:+.2f}, {row['rho_high']:+.2f}]"
         counted = f"{row['alike']} of {row['contrasts']}"
-        rows.append((f"{row['first']} and {row['second']}", counted, share, rho))
-    header = ("compared", "same sign", "share [95 %]", "Spearman [95 %]")
+        compared = f"{row['first']} and {row['second']}"
+        rows.append((compared, counted, str(row["tables"]), share, rho))
+    header = ("compared", "same sign", "tables", "share [95 %]", "Spearman [95 %]")
     return TextTable("", header, tuple(rows))
 
 
@@ -108,21 +110,54 @@ def sides_grid(contrasts: pd.DataFrame, beside: str) -> TextTable:
     `beside` is the beginning of a kind (`sweeps.judge.agreement.kinds_of`). A star says that the
     interval excludes 0, "declared" that the seeds were declared.
     """
-    low, high = ends_of(contrasts)
-    frame = contrasts.assign(
-        ours=ours_of(contrasts), kind=kinds_of(contrasts), low=low, high=high
-    ).dropna(subset=["ours"])
-    kinds = sorted(frame["kind"].unique(), key=lambda kind: (kind.startswith(beside), kind))
+    frame, kinds = _sides(contrasts, beside)
     rows = []
     for (table, _, contrast), own in frame.groupby(["table", "claim", "contrast"], sort=False):
-        if not own["kind"].str.startswith(beside).any():
-            continue
         by_kind = {row["kind"]: _side(row) for _, row in own.iterrows()}
         value = own["printed"].iloc[0]
         printed = ABSENT if math.isnan(value) else f"{value:+.2f}"
         cells = [by_kind.get(kind, ABSENT) for kind in kinds]
         rows.append((f"{table}: {contrast}", printed, *cells))
     return TextTable("", ("contrast", PRINT, *kinds), tuple(rows))
+
+
+def sides_figure(contrasts: pd.DataFrame, beside: str) -> Figure | None:
+    """Draw the contrasts of `sides_grid`: print hollow, runs on `beside` full, others pale."""
+    from analysis.figures.plots import new_figure
+
+    frame, kinds = _sides(contrasts, beside)
+    if frame.empty:
+        return None
+    groups = list(frame.groupby(["table", "claim", "contrast"], sort=False))
+    figure = new_figure(8.6, 1.6 + 0.24 * len(groups))
+    axes = figure.subplots()
+    axes.axvline(0, color="grey", lw=0.8, zorder=1)
+    places = {name: place for place, (name, _) in enumerate(groups)}
+    names = frame[["table", "claim", "contrast"]].itertuples(index=False, name=None)
+    frame = frame.assign(place=[places[name] for name in names])
+    for kind in kinds:
+        own = frame[frame["kind"] == kind]
+        is_beside = kind.startswith(beside)
+        colour, shift = (OURS, -0.14) if is_beside else (PALE, 0.14)
+        _bars(axes, own, own["place"] + shift, colour, kind)
+    printed = frame.drop_duplicates("place")
+    _printed(axes, printed["printed"], printed["place"])
+    labels = [_name_of(own.iloc[0]) for _, own in groups]
+    _finish(figure, axes, labels)
+    return figure
+
+
+def _sides(contrasts: pd.DataFrame, beside: str) -> tuple[pd.DataFrame, list[str]]:
+    """The contrasts that runs on `beside` have, with ours, low, high and kind; and the kinds."""
+    low, high = ends_of(contrasts)
+    frame = contrasts.assign(
+        ours=ours_of(contrasts), kind=kinds_of(contrasts), low=low, high=high
+    ).dropna(subset=["ours"])
+    is_beside = frame["kind"].str.startswith(beside)
+    place = [frame["table"], frame["claim"], frame["contrast"]]
+    frame = frame[is_beside.groupby(place).transform("any")]
+    kinds = sorted(frame["kind"].unique(), key=lambda kind: (kind.startswith(beside), kind))
+    return frame, kinds
 
 
 def _side(row: pd.Series) -> str:
@@ -139,6 +174,8 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
     Those that disagree most with print are on top. `contrasts` is that of
     `sweeps.judge.agreement.contrasts_frame`; None where nothing is to be drawn.
     """
+    import pandas as pd
+
     from analysis.figures.plots import new_figure
 
     ours = ours_of(contrasts)
@@ -152,47 +189,46 @@ def forest_of(contrasts: pd.DataFrame, title: str) -> Figure | None:
     figure = new_figure(8.6, 1.6 + 0.21 * len(frame))
     axes = figure.subplots()
     axes.axvline(0, color="grey", lw=0.8, zorder=1)
-    _marks(axes, frame, "explored", PALE, "ours, explored", 0.14)
-    _marks(axes, frame, "confirmed", OURS, "ours, confirmed by declared seeds", -0.14)
-    places = range(len(frame))
-    axes.scatter(
-        frame["printed"],
-        places,
-        s=26,
-        facecolors="none",
-        edgecolors=PUBLISHED,
-        zorder=4,
-        label="printed",
-    )
-    axes.set_xscale("symlog", linthresh=LINEAR)
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_ylim(len(frame) - 0.5, -0.5)
-    axes.set_yticks(places, [_name_of(row) for _, row in frame.iterrows()], fontsize=7)
-    axes.set_xlabel("difference in percent points (Var: squared); linear between -1 and 1")
-    axes.grid(axis="x", alpha=0.25)
+    places = pd.Series(range(len(frame)), frame.index, dtype=float)
+    for kind, colour, label, shift in (
+        ("explored", PALE, "ours, explored", 0.14),
+        ("confirmed", OURS, "ours, confirmed by declared seeds", -0.14),
+    ):
+        ends = frame[[kind, f"{kind}_low", f"{kind}_high"]].set_axis(
+            ["ours", "low", "high"], axis=1
+        )
+        _bars(axes, ends, places + shift, colour, label)
+    _printed(axes, frame["printed"], places)
     kinds = sorted(set(kinds_of(frame)))
     figure.suptitle(f"{title}: printed differences and ours ({'; '.join(kinds)})", fontsize=10)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
+    _finish(figure, axes, [_name_of(row) for _, row in frame.iterrows()])
     return figure
 
 
-def _marks(
-    axes: Axes, frame: pd.DataFrame, kind: str, colour: str, label: str, shift: float
-) -> None:
-    places = [place + shift for place in range(len(frame))]
-    low = (frame[kind] - frame[f"{kind}_low"]).fillna(0.0)
-    high = (frame[f"{kind}_high"] - frame[kind]).fillna(0.0)
+def _bars(axes: Axes, ends: pd.DataFrame, places: pd.Series, colour: str, label: str) -> None:
+    """Draw differences (`ends`: ours, low, high) with their intervals at the heights `places`."""
+    ours, low, high = (ends[name] for name in ("ours", "low", "high"))
+    lengths = [(ours - low).fillna(0.0), (high - ours).fillna(0.0)]
     axes.errorbar(
-        frame[kind],
-        places,
-        xerr=[low, high],
-        fmt="o",
-        ms=3.5,
-        lw=1.2,
-        color=colour,
-        zorder=3,
-        label=label,
+        ours, places, xerr=lengths, fmt="o", ms=3.5, lw=1.2, color=colour, zorder=3, label=label
     )
+
+
+def _printed(axes: Axes, values: pd.Series, places: pd.Series) -> None:
+    axes.scatter(
+        values, places, s=26, facecolors="none", edgecolors=PUBLISHED, zorder=4, label="printed"
+    )
+
+
+def _finish(figure: Figure, axes: Axes, names: Sequence[str]) -> None:
+    """Label a chart of differences."""
+    axes.set_xscale("symlog", linthresh=LINEAR)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.set_xlabel("difference in percent points (Var: squared); linear between -1 and 1")
+    axes.grid(axis="x", alpha=0.25)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
 
 
 def _name_of(row: pd.Series) -> str:

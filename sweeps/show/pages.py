@@ -29,6 +29,7 @@ from sweeps.show.agreement import (
     agreement_lines,
     pairs_grid,
     ranks_grid,
+    sides_figure,
     sides_grid,
     signs_grid,
     signs_in_words,
@@ -238,6 +239,9 @@ class Report:
             for paper in self.papers:
                 if paper["forest"] is not None:
                     save(paper["forest"], Path(folder, paper["picture"]))
+            sides = sides_figure(self.contrasts, REAL)
+            if sides is not None:
+                save(sides, Path(folder, "real-images_contrasts.svg"))
             return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
     def filled(self, text: str) -> str:

@@ -25,6 +25,7 @@ from sweeps.show.agreement import (
     forest_of,
     pairs_grid,
     ranks_grid,
+    sides_figure,
     sides_grid,
     signs_grid,
 )
@@ -185,7 +186,18 @@ def test_print_bench_and_real_images_are_compared_in_pairs() -> None:
     row = found[images, synthetic]
     assert row["rho"] == pytest.approx(0.5), "ranks 2 1 3 and 3 1 2"
     assert row["low"] <= 1.0 <= row["high"]
-    assert "| 3 of 3 | 100 % [" in pairs_grid(pairs_of(both)).to_markdown()
+    assert row["tables"] == 2
+    assert "| 3 of 3 | 2 | 100 % [" in pairs_grid(pairs_of(both)).to_markdown()
     text = sides_grid(both, "real images").to_markdown()
     assert "| one: a | +1.00 | +1.00 [+0.00, +2.00] | +5.00* [+4.00, +6.00] |" in text
     assert "two: c" not in text, "it was not run on real images"
+    figure = sides_figure(both, "real images")
+    assert figure is not None
+    (axes,) = figure.axes
+    assert [name.get_text() for name in axes.get_yticklabels()] == ["one: a", "one: b", "two: d"]
+    drawn = {bars.get_label(): bars.lines[0].get_xdata() for bars in axes.containers}
+    assert {kind: list(values) for kind, values in drawn.items()} == {
+        synthetic: [1.0, -2.0, 0.5],
+        images: [5.0, -7.0, 6.0],
+    }
+    assert sides_figure(bench, "real images") is None
