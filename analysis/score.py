@@ -281,21 +281,21 @@ def _make_room(out: Path | None, source: str) -> None:
 
 
 def _scored(options: ScoreOptions, overrides: list[str]) -> FolderScores:
-    from analysis.predictions.scoring import ScoringOptions, score_folder
-    from rgbt.data.predictions import Affixes, FormatOptions
+    from analysis.predictions.scoring import score_folder
 
-    dataset = dataset_of(overrides)
-    affixes = Affixes(options.prefix, options.suffix)
-    counting = ScoringOptions(
-        regions=options.regions,
-        format=FormatOptions(form=options.format, palette=options.palette, affixes=affixes),
-        resize=options.resize,
-        name=options.name,
-        absent=built("metric", overrides).absent,
-    )
-    folder, split = Path(options.predictions), options.split or "test"
+    dataset, split = dataset_of(overrides), options.split or "test"
     with progress("counting", len(dataset.names(split))) as advance:
-        return score_folder(folder, dataset, split, counting, advance)
+        return score_folder(
+            Path(options.predictions),
+            dataset,
+            split,
+            regions=options.regions,
+            given=options,
+            resize=options.resize,
+            name=options.name,
+            absent=built("metric", overrides).absent,
+            advance=advance,
+        )
 
 
 def _stored_counts(options: ScoreOptions, overrides: list[str]) -> list[CountsOf]:

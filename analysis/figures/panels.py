@@ -38,7 +38,7 @@ from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.data.files import decode, read_rgb
 from rgbt.data.mfnet import NextFrames
-from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader
+from rgbt.data.predictions import PredictionReader
 from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
@@ -91,18 +91,12 @@ class PictureOptions(PredictionFormatOptions):
     split: Split = ""
     layout: Layout = "rows"
 
-    @property
-    def form(self) -> FormatOptions:
-        """The format of the files."""
-        affixes = Affixes(self.prefix, self.suffix)
-        return FormatOptions(form=self.format, palette=self.palette, affixes=affixes)
-
 
 def read_prediction(
     folder: Path, reader: PredictionReader, name: str, image_hw: tuple[int, ...]
 ) -> Bytes:
     """Read (H, W) class indices; InputError: no such file, or of another size than the image."""
-    path = folder / f"{reader.options.affixes.file_stem(name)}.png"
+    path = reader.path(folder, name)
     if not path.is_file():
         raise InputError(f"methods: there is no prediction {path}.")
     found = reader.read(path)
@@ -121,7 +115,7 @@ def qualitative(config: Config, given: PictureOptions) -> Drawn:
     if regions.aspect is None:
         raise InputError(f"metric: {regions.name} has no centre to put a box on; use rings.")
     folders = labelled(given.methods)
-    made, cells, frame = panel(config.dataset, folders, shown, given.form, given.layout)
+    made, cells, frame = panel(config.dataset, folders, shown, given, given.layout)
     height, width = cells[0, 0].images[0].get_array().shape[:2]
     rows, columns = ring_rectangle((height, width), regions.regions, 1, regions.aspect)
     corner = (columns.start - 0.5, rows.start - 0.5)
@@ -156,7 +150,7 @@ def missing(
         for kind, folders in three.items():
             every[f"{label}\n{kind}"] = folders[label]
     shown = config.names(given.names, given.split, rows)
-    made, cells, frame = panel(config.dataset, every, shown, given.form, given.layout)
+    made, cells, frame = panel(config.dataset, every, shown, given, given.layout)
     for axes, score in zip(cells[:, 3:].flat, frame["mIoU"], strict=True):
         plots.in_corner(axes, f"{score:.1f}")
     return made, frame
@@ -166,7 +160,7 @@ def panel(
     dataset: LabelledDataset,
     folders: Mapping[str, Path],
     names: Sequence[str],
-    form: FormatOptions,
+    given: PredictionFormatOptions,
     layout: str = "rows",
 ) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
     """Draw the pictures of a panel, a row per name; return the figure, its axes, and the mIoU.
@@ -175,7 +169,7 @@ def panel(
     because a single image lacks most classes. InputError: images without label or of several sizes,
     or a missing prediction.
     """
-    reader = PredictionReader(dataset.classes, dataset.palette, form)
+    reader = PredictionReader(dataset.classes, dataset.palette, *given.form)
     palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
     scored = scored_classes(dataset.classes, dataset.unscored)
     for name in names:
@@ -257,7 +251,7 @@ def read_pairs(
     of_set = {pair.first: pair for pair in listed.pairs if pair.set == view_set}
     if not of_set:
         raise InputError(f"view_set={view_set}: the export has no such set of views.")
-    reader, found = PredictionReader(dataset.classes, dataset.palette, given.form), []
+    reader, found = PredictionReader(dataset.classes, dataset.palette, *given.form), []
     for name in chosen_names(given.names, [*of_set], given.rows):
         pair = of_set[name]
         first, of_first = labelled_sample(dataset, name)

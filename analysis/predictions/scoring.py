@@ -17,7 +17,8 @@ from scipy.optimize import linear_sum_assignment
 from analysis.commands import in_threads
 from analysis.predictions.maps import PixelMaps, add_image
 from rgbt.checks import InputError
-from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, PredictionReader
+from rgbt.config.common_options import PredictionFormatOptions
+from rgbt.data.predictions import OVERLAY, Array, PredictionReader
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.counting import region_counts
 from rgbt.metrics.counts import Counts
@@ -39,35 +40,12 @@ LEAST_GAIN = 0.1
 SHOWN = 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoringOptions:
-    """How a folder of predictions is counted.
-
-    Attributes:
-        partitions: how the image is cut; all are counted in the same pass.
-        regions: R of each partition.
-        format: see `rgbt.data.predictions.FormatOptions`.
-        resize: "refuse" predictions of another size than the label, or take for every pixel of the
-            label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
-            where the ratio of height and width differs.
-        name: of the method; "": the folder's name.
-        absent: convention for absent classes of the data set, stored with the counts.
-    """
-
-    partitions: tuple[Partition, ...] = PARTITIONS
-    regions: int = 5
-    format: FormatOptions = FormatOptions()
-    resize: Resize = "refuse"
-    name: str = ""
-    absent: Absent = "released"
-
-
 @dataclass(frozen=True)
 class FolderScores:
     """Result of counting a folder of predictions.
 
     Attributes:
-        counts: one per partition, in the order of `ScoringOptions.partitions`.
+        counts: one per partition, in the order of the partitions.
         maps: counts by pixel; None where the images differ in size.
         extra: names of PNG files that belong to no image of the split (overlays left out).
         resized: name of an image whose prediction had another size -> both sizes, such as "480x640
@@ -112,32 +90,39 @@ class FolderScores:
 
 
 def find(
-    folder: Path, names: Sequence[str], affixes: Affixes
+    folder: Path, names: Sequence[str], reader: PredictionReader
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Find the predictions of images in their order: files prefix + NAME + suffix + ".png".
+    """Find the predictions of images in their order: files as `PredictionReader.path` names them.
 
     Also the names of other PNG files, overlays apart. InputError: no such folder, or a file misses.
     """
     if not folder.is_dir():
         raise InputError(f"predictions: no such folder: {folder}")
-    stems = {path.stem for path in folder.glob("*.png")}
-    own = [affixes.file_stem(name) for name in names]
-    absent = [f"{stem}.png" for stem in own if stem not in stems]
+    found = set(folder.glob("*.png"))
+    paths = [reader.path(folder, name) for name in names]
+    absent = [path.relative_to(folder).as_posix() for path in paths if path not in found]
     if absent:
         held = _listed(sorted(path.name for path in folder.iterdir())) or "nothing"
         raise InputError(
             f"predictions: {folder} lacks {len(absent)} of the {len(names)} images of the split "
             f"({_listed(absent)}); it contains {held}. Add them, or choose another split."
         )
-    known = {*own, *(f"{name}{OVERLAY}" for name in names)}
-    return [folder / f"{stem}.png" for stem in own], tuple(sorted(stems - known))
+    overlays = (folder / f"{name}{OVERLAY}.png" for name in names)
+    others = found.difference(paths, overlays)
+    return paths, tuple(sorted(path.stem for path in others))
 
 
-def score_folder(
+def score_folder(  # noqa: PLR0913 - options of a command
     folder: Path,
     dataset: LabelledDataset,
     split: str,
-    options: ScoringOptions = ScoringOptions(),  # noqa: B008 - frozen
+    *,
+    partitions: tuple[Partition, ...] = PARTITIONS,
+    regions: int = 5,
+    given: PredictionFormatOptions = PredictionFormatOptions(),  # noqa: B008 - frozen
+    resize: Resize = "refuse",
+    name: str = "",
+    absent: Absent = "released",
     advance: Callable[[], None] = lambda: None,
 ) -> FolderScores:
     """Count predicted label images of any method against the labels of a split.
@@ -149,7 +134,14 @@ def score_folder(
         folder: holds NAME.png for every image of the split; other files are not read.
         dataset: names, labels, classes and colours.
         split: of the data set.
-        options: see `ScoringOptions`.
+        partitions: how the image is cut; all are counted in the same pass.
+        regions: R of each partition.
+        given: the format of the files.
+        resize: "refuse" predictions of another size than the label, or take for every pixel of the
+            label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
+            where the ratio of height and width differs.
+        name: of the method; "": the folder's name.
+        absent: convention for absent classes of the data set, stored with the counts.
         advance: called after each image.
 
     Raises:
@@ -157,9 +149,9 @@ def score_folder(
             of several, the first in the order of the split.
     """
     names = dataset.names(split)
-    paths, extra = find(folder, names, options.format.affixes)
-    reader = PredictionReader(dataset.classes, dataset.palette, options.format)
-    partitions = [_regions(partition, options.regions) for partition in options.partitions]
+    reader = PredictionReader(dataset.classes, dataset.palette, *given.form)
+    paths, extra = find(folder, names, reader)
+    cuts = [_regions(partition, regions) for partition in partitions]
     size = _label_of(dataset, names[0]).shape
     sums, lock = np.zeros((2, dataset.num_classes, *size), np.int32), Lock()
 
@@ -168,16 +160,16 @@ def score_folder(
         label, prediction, sizes = _label_of(dataset, image), reader.read(path), ""
         if prediction.shape != label.shape:
             sizes = f"{_size(prediction)} to {_size(label)}"
-            prediction = _resized(prediction, label, path, options.resize)
+            prediction = _resized(prediction, label, path, resize)
         if label.shape == size:
             with lock:
                 add_image(sums, label, prediction)
         matrices = []
-        for regions in partitions:
-            matrices.append(region_counts(label, prediction, dataset.num_classes, regions))
+        for cut in cuts:
+            matrices.append(region_counts(label, prediction, dataset.num_classes, cut))
         return np.stack(matrices), _size(label), sizes
 
-    shape = (len(partitions), len(names), options.regions, *[dataset.num_classes] * 2)
+    shape = (len(cuts), len(names), regions, *[dataset.num_classes] * 2)
     counts, resized, label_sizes = np.zeros(shape, np.int32), {}, set()
     for index, (matrices, label_size, sizes) in enumerate(in_threads(count, names, paths)):
         counts[:, index] = matrices
@@ -185,7 +177,7 @@ def score_folder(
         if sizes:
             resized[names[index]] = sizes
         advance()
-    name = options.name or folder.resolve().name
+    name = name or folder.resolve().name
     shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
     of: dict[str, Any] = {"split": split, "dataset": dataset.fingerprint()}
     maps = None
@@ -193,11 +185,11 @@ def score_folder(
         about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
         maps = PixelMaps(intersection=sums[0], union=sums[1], **about, **of, **shared)
     # Whatever a method gets to see, the images are those of both cameras.
-    of |= {"absent": options.absent, "view": "rgbt", "dataset_name": dataset.name}
+    of |= {"absent": absent, "view": "rgbt", "dataset_name": dataset.name}
     shared |= {"names": names, "night": dataset.nights(names)}
     made = []
-    for by_image, regions in zip(counts, partitions, strict=True):
-        measurement = Measurement(partition=regions.name, **of)
+    for by_image, cut in zip(counts, cuts, strict=True):
+        measurement = Measurement(partition=cut.name, **of)
         made.append(Counts(counts=by_image, measurement=measurement, **shared))
     labels = f"{dataset.splits[split]}, labels of {_listed(sorted(label_sizes))} pixels"
     return FolderScores(name, tuple(made), maps, extra, resized, dataset.background, labels)

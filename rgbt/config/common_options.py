@@ -59,6 +59,11 @@ class PredictionFormatOptions:
     prefix: Annotated[str, Help("start of the file names, such as Pred_")] = ""
     suffix: Annotated[str, Help("end of the file names, such as _pred")] = ""
 
+    @property
+    def form(self) -> tuple[Literal["index", "colour"], str, str, str]:
+        """Return all of them, as `rgbt.data.predictions.PredictionReader` takes them."""
+        return self.format, self.palette, self.prefix, self.suffix
+
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:

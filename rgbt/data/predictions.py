@@ -6,11 +6,11 @@ the colours of a palette, with or without indices of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,45 +28,29 @@ Format = Literal["index", "colour"]
 OVERLAY = "_overlay"
 
 
-class Affixes(NamedTuple):
-    """Says what is before and after the name of an image in the name of its prediction."""
-
-    prefix: str = ""
-    suffix: str = ""
-
-    def file_stem(self, name: str) -> str:
-        """Return the name of the prediction without ".png"."""
-        return f"{self.prefix}{name}{self.suffix}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class FormatOptions:
-    """Holds what the user states about the files of predictions.
-
-    `form`: "index": the stored numbers are classes; "colour": the colours shown are. `palette`: of
-    the data set, or of a YAML file with that key, such as a file of conf/dataset.
-    """
-
-    form: Format = "index"
-    palette: str = "dataset"
-    affixes: Affixes = Affixes()
-
-    def __post_init__(self) -> None:
-        check_choice("format", self.form, ("index", "colour"))
-
-
 @dataclass(frozen=True)
 class PredictionReader:
-    """Reads predictions of one format in terms of the K `classes` of a data set, of K `colours`."""
+    """Reads predictions of one format in terms of the K `classes` of a data set, of K `colours`.
+
+    `format`: "index": the stored numbers are classes; "colour": the colours shown are. `palette`:
+    of the data set, or of a YAML file with that key, such as a file of conf/dataset. `prefix` and
+    `suffix` are before and after the name of an image in the name of its prediction.
+    """
 
     classes: tuple[str, ...]
     colours: Sequence[Colour]
-    options: FormatOptions = FormatOptions()
+    format: Format = "index"
+    palette: str = "dataset"
+    prefix: str = ""
+    suffix: str = ""
+
+    def __post_init__(self) -> None:
+        check_choice("format", self.format, ("index", "colour"))
 
     @cached_property
     def known(self) -> tuple[int, ...]:
         """Return the colour of each class as one number; InputError for a file without colours."""
-        palette, colours = self.options.palette, cast(Any, self.colours)
+        palette, colours = self.palette, cast(Any, self.colours)
         if palette != "dataset":
             content = read_yaml(Path(palette).expanduser())
             colours = content.get("palette") if isinstance(content, dict) else None
@@ -82,13 +66,16 @@ class PredictionReader:
     @cached_property
     def codes(self) -> LabelCodes:
         """Return the class of each stored number or colour; InputError for two of one colour."""
-        if self.options.form == "index":
+        if self.format == "index":
             return LabelCodes({index: index for index in range(len(self.classes))})
         if len(set(self.known)) < len(self.known):
-            palette = self.options.palette
-            raise InputError(f"palette={palette}: two classes have one colour; save indices.")
+            raise InputError(f"palette={self.palette}: two classes have one colour; save indices.")
         codes = {code: index for index, code in enumerate(self.known)}
-        return LabelCodes(codes, f"palette={self.options.palette}", of_colours=True)
+        return LabelCodes(codes, f"palette={self.palette}", of_colours=True)
+
+    def path(self, folder: Path, name: str) -> Path:
+        """Return the file of the prediction of an image, whether it exists or not."""
+        return folder / f"{self.prefix}{name}{self.suffix}.png"
 
     def read(self, path: Path) -> Array:
         """Read class indices (H, W) uint8, all below K.
@@ -96,14 +83,14 @@ class PredictionReader:
         Raises:
             InputError: not readable, another format than stated, or an unknown index or colour.
         """
-        if self.options.form == "colour":
+        if self.format == "colour":
             return self.codes.read(path)
         image = open_indices(path)
         raw = values_of(image)
         if raw.dtype != np.uint8:
             raise InputError(f"{path}: expected one channel of 8 bits, got mode {image.mode}.")
         found = self.codes.classes(raw, path)
-        if image.mode == "P" and self.options.palette == "dataset":
+        if image.mode == "P" and self.palette == "dataset":
             # Refuse indices that are shown in colours of other classes of the data set.
             palette = code_of(np.reshape(image.getpalette("RGB") or [], (-1, 3))).tolist()
             shown = {index: palette[index] for index in np.unique(found) if index < len(palette)}
@@ -116,8 +103,3 @@ class PredictionReader:
                         "palette of the method with palette=FILE.yaml if the indices are."
                     )
         return found
-
-
-def prediction_paths(folder: Path, names: Iterable[str], affixes: Affixes) -> dict[str, Path]:
-    """Return the file of the prediction of each image, whether it exists or not."""
-    return {name: folder / f"{affixes.file_stem(name)}.png" for name in names}

@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +14,11 @@ import pytest
 from PIL import Image
 
 from analysis.predictions.maps import PixelMaps
-from analysis.predictions.scoring import ScoringOptions, score_folder
+from analysis.predictions.scoring import score_folder
 from analysis.score import add_intervals, conventions, entry, score_tables, scores
 from analysis.uncertainty import Resampling, estimate
+from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.data.mfnet import MFNet
-from rgbt.data.predictions import Affixes, FormatOptions
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from tests.analysis.counts import counts_of
@@ -263,9 +264,9 @@ def test_published_predictions_give_the_known_counts_in_every_form(
         else:
             image = Image.fromarray(colours[indices])
         image.save(folder / f"Pred_{path.name}")
-    form = FormatOptions(form="colour" if kind == "rgb" else "index", affixes=Affixes("Pred_"))
-    options = ScoringOptions(resize="nearest" if kind == "larger" else "refuse", format=form)
-    scored = score_folder(folder, dataset, "test", options)
+    given = PredictionFormatOptions(format="colour" if kind == "rgb" else "index", prefix="Pred_")
+    resize: Any = "nearest" if kind == "larger" else "refuse"
+    scored = score_folder(folder, dataset, "test", given=given, resize=resize)
     expected = json.loads((REAL / "predictions20" / "expected_confusions.json").read_text())
     for counts in scored.counts:
         np.testing.assert_array_equal(counts.whole(), expected["LASNet/test"]["confusion"])

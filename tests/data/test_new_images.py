@@ -18,7 +18,7 @@ from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.new_images import of_arrays, of_files, of_path, of_split
 from rgbt.data.patterns import Patterns
-from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
+from rgbt.data.predictions import PredictionReader
 from rgbt.data.pst900 import PST900
 from rgbt.types import Sample
 from tests.conftest import write_png
@@ -175,8 +175,7 @@ COLOURS = np.array(PALETTE, np.uint8)[INDICES]
 
 
 def read(path: Path, form: str = "index", **options: Any) -> np.ndarray:
-    stated = FormatOptions(form=form, **options)  # type: ignore[arg-type]
-    return PredictionReader(CLASSES, PALETTE, stated).read(path)
+    return PredictionReader(CLASSES, PALETTE, form, **options).read(path)  # type: ignore[arg-type]
 
 
 def save(path: Path, values: object, palette: object = None) -> Path:
@@ -256,6 +255,7 @@ def test_invalid_palettes_are_refused(tmp_path: Path, palette: object, said: str
 
 
 def test_names_of_files(tmp_path: Path) -> None:
-    paths = prediction_paths(tmp_path, ["a", "b/c"], Affixes("Pred_", "_x"))
-    assert paths == {"a": tmp_path / "Pred_a_x.png", "b/c": tmp_path / "Pred_b/c_x.png"}
+    reader = PredictionReader(CLASSES, PALETTE, prefix="Pred_", suffix="_x")
+    assert reader.path(tmp_path, "a") == tmp_path / "Pred_a_x.png"
+    assert reader.path(tmp_path, "b/c") == tmp_path / "Pred_b/c_x.png"
     assert "format: 'colours' is not a valid choice" in refused(lambda: read(tmp_path, "colours"))

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import PredictionFormatOptions
-from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
+from rgbt.data.predictions import PredictionReader
 from rgbt.data.video import FramesInOrder
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
@@ -92,17 +92,17 @@ def _write(batch: Batch, names: Sequence[str], out: Path) -> None:
 
 
 def folder_predictions(
-    folder: Path, pairs: FramePairs, names: Sequence[str], given: FormatOptions
+    folder: Path, pairs: FramePairs, names: Sequence[str], given: PredictionFormatOptions
 ) -> Predict:
     """Return a function that reads predictions of any method, label images in `folder`.
 
     InputError: files of `names` are missing; the function: one has another size than its image.
     """
-    paths = prediction_paths(folder, names, given.affixes)
+    reader = PredictionReader(pairs.dataset.classes, pairs.dataset.palette, *given.form)
+    paths = {name: reader.path(folder, name) for name in names}
     missing = [path for path in paths.values() if not path.is_file()]
     if missing:
         raise InputError(f"predictions={missing[0]} and {len(missing) - 1} more do not exist.")
-    reader = PredictionReader(pairs.dataset.classes, pairs.dataset.palette, given)
 
     def predict(batch: Batch, names: Sequence[str]) -> Tensor:
         wanted, maps = tuple(batch.label.shape[1:]), []
@@ -131,9 +131,7 @@ def count_predictions(
         wanted = list_pairs(pairs)
         pair_list.check_same(pair_list.read_list(exported), wanted)
         names = wanted.images
-    affixes = Affixes(options.prefix, options.suffix)
-    given = FormatOptions(form=options.format, palette=options.palette, affixes=affixes)
-    predict = folder_predictions(folder, pairs, names, given)
+    predict = folder_predictions(folder, pairs, names, options)
     measurement = Measurement(
         dataset=pairs.dataset.fingerprint(),
         split=pairs.split,

@@ -11,7 +11,7 @@ import pytest
 
 from analysis.figures.__main__ import entry
 from analysis.figures.inputs import FIGURES
-from analysis.predictions.scoring import ScoringOptions, score_folder
+from analysis.predictions.scoring import score_folder
 from analysis.statistics.collect import SpatialStatistics
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert label is not None
             wrong = (label + shift * (np.arange(96) < index)) % 9
             cv2.imwrite(str(folder / method / f"{name}.png"), wrong.astype(np.uint8))
-        scored = score_folder(folder / method, dataset, "test", ScoringOptions(regions=5))
+        scored = score_folder(folder / method, dataset, "test", regions=5)
         scored.save(folder / method)
     labels = np.random.default_rng(0).integers(0, 3, (20, 64, 96), dtype=np.uint8)
     night = np.arange(20) % 2 == 0

@@ -27,10 +27,10 @@ from analysis.figures.panels import (
 )
 from rgbt import consistency
 from rgbt.checks import InputError
+from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
-from rgbt.data.predictions import FormatOptions
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.types import MaskPair, Sample
@@ -87,7 +87,7 @@ def test_scores_of_an_image_exclude_unscored_classes(dataset: MFNet, tmp_path: P
 
     def miou(*left_out: int) -> float:
         dataset.unscored = tuple(dataset.classes[index] for index in left_out)
-        *_, frame = panel(dataset, {"ours": tmp_path}, ["00001D"], FormatOptions())
+        *_, frame = panel(dataset, {"ours": tmp_path}, ["00001D"], PredictionFormatOptions())
         return frame["mIoU"][0]
 
     shared, others = own / (own + more), len(present) - 2

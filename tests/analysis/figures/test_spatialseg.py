@@ -20,7 +20,7 @@ from analysis.figures.spatialseg import (
     trend,
 )
 from analysis.predictions.maps import PixelMaps
-from analysis.predictions.scoring import ScoringOptions, score_folder
+from analysis.predictions.scoring import score_folder
 from analysis.statistics.resampled import ResampledSplit
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
@@ -80,7 +80,7 @@ def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absen
         cv2.imwrite(str(tmp_path / "labels" / f"{name}.png"), label)
         cv2.imwrite(str(tmp_path / "ours" / f"{name}.png"), predicted)
     dataset = MFNet(str(tmp_path))
-    scored = score_folder(tmp_path / "ours", dataset, "test", ScoringOptions(regions=5))
+    scored = score_folder(tmp_path / "ours", dataset, "test", regions=5)
     assert scored.maps is not None
     rings = Regions(partition="ring", regions=5, aspect="image", absent=absent)
     heat = iou_heat(scored.maps, rings)

@@ -1,26 +1,31 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from analysis import commands
-from analysis.predictions.scoring import ScoringOptions, class_remarks, find, score_folder
+from analysis.predictions.scoring import class_remarks, find, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.data.predictions import Affixes
+from rgbt.data.predictions import PredictionReader
 from rgbt.metrics.metric import Regions
 from tests.analysis.counts import counts_of
 from tests.analysis.predictions.conftest import LABELS, PREDICTIONS, Write
 
-STRIPS = ScoringOptions(partitions=("vertical", "horizontal"), regions=2)
+STRIPS: dict[str, Any] = {"partitions": ("vertical", "horizontal"), "regions": 2}
+RESIZED: dict[str, Any] = {"partitions": ("vertical",), "regions": 2, "resize": "nearest"}
+
+
+def named(prefix: str = "", suffix: str = "") -> PredictionReader:
+    return PredictionReader((), (), prefix=prefix, suffix=suffix)
 
 
 def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
-    scored = score_folder(write(PREDICTIONS), tiny, "test", STRIPS)
+    scored = score_folder(write(PREDICTIONS), tiny, "test", **STRIPS)
     vertical, horizontal = scored.counts
     first = [[[4, 0, 0], [1, 3, 0], [0, 0, 0]], [[4, 0, 0], [0, 0, 0], [1, 1, 1]]]
     second = [[[8, 0, 0], [0, 0, 0], [0, 0, 0]]] * 2
@@ -84,9 +89,8 @@ def test_other_size_is_refused_or_read_at_nearest_pixel(tiny: MFNet, write: Writ
     with pytest.raises(
         InputError, match=r"00001D\.png is 2x2 pixels but its label is 4x4.*nearest"
     ):
-        score_folder(folder, tiny, "test", STRIPS)
-    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
-    scored = score_folder(folder, tiny, "test", options)
+        score_folder(folder, tiny, "test", **STRIPS)
+    scored = score_folder(folder, tiny, "test", **RESIZED)
     # Each predicted pixel stands for 2 x 2: all of the car, all of the person are right.
     first = scored.counts[0].counts[0]
     np.testing.assert_array_equal(first.sum(0), [[8, 0, 0], [0, 4, 0], [0, 0, 3]])
@@ -98,10 +102,9 @@ def test_other_size_is_refused_or_read_at_nearest_pixel(tiny: MFNet, write: Writ
 
 def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> None:
     folder = write({name: np.zeros((8, 4), np.uint8) for name in ("00001D", "00002N")})
-    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
     with pytest.raises(InputError, match=r"is 8x4 pixels but its label is 4x4, .*resize=stretch"):
-        score_folder(folder, tiny, "test", options)
-    scored = score_folder(folder, tiny, "test", replace(options, resize="stretch"))
+        score_folder(folder, tiny, "test", **RESIZED)
+    scored = score_folder(folder, tiny, "test", **{**RESIZED, "resize": "stretch"})
     assert scored.resized == dict.fromkeys(LABELS, "8x4 to 4x4")
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 16]
 
@@ -109,8 +112,7 @@ def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> Non
 def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> None:
     """3 columns on 4: centres at 0.375, 1.125, 1.875 and 2.625 lie in columns 0, 1, 1, 2."""
     folder = write({name: [[0, 1, 2]] * 3 for name in PREDICTIONS})
-    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
-    second = score_folder(folder, tiny, "test", options).counts[0].counts[1]  # label 0 everywhere
+    second = score_folder(folder, tiny, "test", **RESIZED).counts[0].counts[1]  # label 0 everywhere
     np.testing.assert_array_equal(second[:, 0], [[4, 4, 0], [0, 4, 4]])
 
 
@@ -118,13 +120,13 @@ def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> 
     bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
     for _ in range(3):
         with pytest.raises(InputError, match=r"00001D\.png: label value 7 .16 pixels"):
-            score_folder(bad, tiny, "test", STRIPS)
+            score_folder(bad, tiny, "test", **STRIPS)
 
 
 def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Write) -> None:
     larger = np.zeros((6, 8), np.uint8)
     cv2.imwrite(str(tiny.files("00002N")[-1]), larger)
-    scored = score_folder(write(PREDICTIONS | {"00002N": larger}), tiny, "test", STRIPS)
+    scored = score_folder(write(PREDICTIONS | {"00002N": larger}), tiny, "test", **STRIPS)
     assert scored.maps is None
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]
 
@@ -135,27 +137,27 @@ def test_only_names_of_the_split_are_taken(tmp_path: Path, affixes: tuple[str, s
     stems = [f"{affixes[0]}{name}{affixes[1]}" for name in names]
     for stem in (*stems, "mean", "00001D_overlay"):
         (tmp_path / f"{stem}.png").touch()
-    paths, extra = find(tmp_path, names, Affixes(*affixes))
+    paths, extra = find(tmp_path, names, named(*affixes))
     assert paths == [tmp_path / f"{stem}.png" for stem in stems]
     assert extra == ("mean",)  # pictures of rgbt.predict are no stray predictions
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="predictions: no such folder"):
-        find(tmp_path / "none", ("a",), Affixes())
+        find(tmp_path / "none", ("a",), named())
     for name in "bcde":
         (tmp_path / f"{name}.png").touch()
     with pytest.raises(InputError, match=r"lacks 1 of the 2 .*\(a\.png\).* contains .* and 1 more"):
-        find(tmp_path, ("a", "b"), Affixes())
+        find(tmp_path, ("a", "b"), named())
 
 
 def test_classes_with_other_indices_are_reported(tiny: MFNet, write: Write) -> None:
     """Car and person exchanged: car 0 / 3 instead of 3 / 4, person 0 / 4 instead of 1 / 3."""
     other = {name: np.array([0, 2, 1])[np.array(value)] for name, value in PREDICTIONS.items()}
-    remarks = score_folder(write(other), tiny, "test", STRIPS).remarks()
+    remarks = score_folder(write(other), tiny, "test", **STRIPS).remarks()
     assert len(remarks) == 1
     assert "better with 2 as 1 (car), 1 as 2 (person)." in remarks[0]
-    own = score_folder(write(PREDICTIONS, "own"), tiny, "test", STRIPS)
+    own = score_folder(write(PREDICTIONS, "own"), tiny, "test", **STRIPS)
     assert own.remarks() == []
 
 
@@ -174,5 +176,5 @@ def test_other_indices_need_two_labels_that_gain(
 
 def test_classes_that_are_never_predicted_are_named(tiny: MFNet, write: Write) -> None:
     folder = write({name: np.zeros((4, 4)) for name in PREDICTIONS})
-    remarks = score_folder(folder, tiny, "test", STRIPS).remarks()
+    remarks = score_folder(folder, tiny, "test", **STRIPS).remarks()
     assert remarks == ["No prediction holds these classes of the labels: car, person."]
