@@ -38,7 +38,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
 from rgbt.requirements import check_requirements
-from rgbt.runs.run_spec import WEIGHTS, RunSpec, SourceSeeds
+from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.terminal import info
 from rgbt.transforms.views import ViewSets
 
@@ -52,7 +52,6 @@ class Session:
     """What every command needs, built once.
 
     Attributes:
-        drawn: seed of every source of random draws.
         regions: partition of the image and the rule for absent classes.
         consistency: virtual views that TC and CA are measured on, if any.
         model: the network, on the device, not wrapped.
@@ -71,7 +70,6 @@ class Session:
     """
 
     spec: RunSpec
-    drawn: SourceSeeds
     dataset: LabelledDataset
     domains: Domains
     transform: Any
@@ -142,9 +140,9 @@ def open_session(
     fix_threads(trainer.threads)
     device = device or choose_device(trainer)
     set_matmul_precision(device, trainer)
-    built = spec.build("drawn", "dataset", "transform", "metric", "consistency")
+    built = spec.build("dataset", "transform", "metric", "consistency")
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(built["drawn"].weights, "weights"))
+        torch.manual_seed(derive(spec.seed_of("weights"), "weights"))
         model: nn.Module = spec.model.build() if network is None else network
     dataset: LabelledDataset = built["dataset"]
     check_dataset(dataset)
@@ -166,7 +164,6 @@ def open_session(
     return Session(
         spec=spec,
         dataset=dataset,
-        drawn=built["drawn"],
         domains=spec.domains,
         transform=built["transform"],
         loading=loading,

@@ -92,7 +92,7 @@ class TrainingSetup:
         """
         session, of_split = self.session, _stored_sizes(self.session)
         train, test = of_split[session.domains.source.split], of_split["test"]
-        rng, transform = numpy_generator(session.drawn.order, "probe"), session.transform
+        rng, transform = numpy_generator(session.spec.seed_of("order"), "probe"), session.transform
         trained = [transform.train(_black(hw), rng) for hw in (min(train), max(train))]
         tested = [transform.test(_black(hw)) for hw in (min(test), max(test))]
         is_part = max(map(len, session.names.values())) > MOST_HEADERS
@@ -105,7 +105,7 @@ class TrainingSetup:
 
     def batches(self, steps: range) -> Batches | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
-        session, seed = self.session, self.session.drawn.order
+        session, seed = self.session, self.session.spec.seed_of("order")
         loading = session.loading
         data, split = self.datasets["source"], session.domains.source.split
         source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
@@ -196,8 +196,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     model = fabric.setup_module(session.model)
     collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
     with torch.random.fork_rng(devices=[]):
-        seed = derive(session.drawn.weights, "scheme weights")  # for networks of the scheme
-        torch.manual_seed(seed)
+        # For networks of the scheme.
+        torch.manual_seed(derive(spec.seed_of("weights"), "scheme weights"))
         scheme: Any = spec.scheme.build(**collaborators, dataset=session.dataset)
     check_part("scheme", scheme)
     components = {

@@ -31,7 +31,7 @@ def try_parts(
 
     InputError names the part, and what it returned or raised.
     """
-    transform, seed = session.transform, session.drawn.order
+    transform, seed = session.transform, session.spec.seed_of("order")
     check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
     first = first_readable(session, names[session.domains.source.split])
@@ -74,7 +74,7 @@ def _black(session: Session, count: int, image_hw: tuple[int, int]) -> tuple[Ten
 
 
 def _generator(session: Session) -> torch.Generator:
-    return torch_generator(session.drawn.order, "probe")
+    return torch_generator(session.spec.seed_of("order"), "probe")
 
 
 def _try_single(session: Session, train_hw: tuple[int, int]) -> None:

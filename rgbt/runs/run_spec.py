@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, cast, overload
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, checked_nodes, objects
@@ -105,14 +105,6 @@ class Seeds:
     order: Seed | None = None
     masks: Seed | None = None
     start: Literal["common", "run"] = "common"
-
-
-class SourceSeeds(NamedTuple):
-    """The seed of every source of random draws; attributes as in `Seeds`."""
-
-    weights: int
-    order: int
-    masks: int
 
 
 # Types of the plain values at the top of the configuration.
@@ -242,6 +234,7 @@ class RunSpec:
             if domains[name] is not None:
                 labels = self._content(labels_key(name), domains[name]["labels"])
                 domains[name] = {**domains[name], "labels": labels}
+        seeds = [self.seed_of("weights"), self.seed_of("order"), self.seed_of("masks")]
         code = user_code(targets(settings).values())
         if model.get("_target_") == EXTERNAL:
             if not (found := checkout_code(self.plain["model"])):
@@ -250,7 +243,7 @@ class RunSpec:
                     f"model.constructor={model['constructor']} in model.root={model['root']}."
                 )
             model["checkout"] = dict(found)
-        return _digest({**settings, "seeds": self.drawn, "code": code})
+        return _digest({**settings, "seeds": seeds, "code": code})
 
     def is_run(self, run: RunResult) -> bool:
         """Say whether a stored run is this one: by its key, or without a checkout by settings.
@@ -282,11 +275,10 @@ class RunSpec:
                 return True
         return any(run.names_files for run in self.upstream)
 
-    @property
-    def drawn(self) -> SourceSeeds:
-        """The seed of every source of random draws."""
-        own = (self.seeds.weights, self.seeds.order, self.seeds.masks)
-        return SourceSeeds(*(self.seed if seed is None else seed for seed in own))
+    def seed_of(self, source: Literal["weights", "order", "masks"]) -> int:
+        """Return the seed of a source of random draws, an attribute of `Seeds`."""
+        own: int | None = getattr(self.seeds, source)
+        return self.seed if own is None else own
 
     @property
     def folder(self) -> Path:

@@ -127,7 +127,7 @@ class Training(Hooks):
         self.setup, self.session, self.spec = setup, setup.session, setup.session.spec
         self.description, self.folder, self.tracking = description, folder, tracking
         settings = settings_digest(self.spec.plain)
-        self.state = State(seed=self.spec.drawn.masks, key=folder.path.name, settings=settings)
+        self.state = State(seed=self.spec.seed_of("masks"), key=folder.path.name, settings=settings)
         self.selected: list[Counts] = []  # counts of the last evaluation in training
 
     def run(self) -> None:

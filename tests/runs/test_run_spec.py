@@ -158,8 +158,8 @@ def test_run_with_another_seed_equals_composing_that_seed(experiment: str) -> No
     made, direct = spec_of(experiment, "seed=0").with_seed(3), spec_of(experiment, "seed=3")
     assert (made.key, made.plain, made.overrides) == (direct.key, direct.plain, direct.overrides)
     assert [run.key for run in made.upstream] == [run.key for run in direct.upstream]
-    drawn = spec_of("grbm", "seeds.order=7").with_seed(2).drawn
-    assert (drawn.weights, drawn.order, drawn.masks) == (2, 7, 2)
+    drawn = spec_of("grbm", "seeds.order=7").with_seed(2).seed_of
+    assert (drawn("weights"), drawn("order"), drawn("masks")) == (2, 7, 2)
 
 
 # A stored run.

@@ -65,7 +65,7 @@ def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
     spec = specified(("+experiment=heatnet_original",))
     named = {"domains": spec.domains, "loading": spec.data, "trainer": spec.trainer}
-    session: Any = SimpleNamespace(spec=spec, transform=full, drawn=spec.seeds, **named)
+    session: Any = SimpleNamespace(spec=spec, transform=full, **named)
     setup: Any = SimpleNamespace(session=session, datasets=dict.fromkeys(("source", "target")))
     setup.rare = None
     TrainingSetup.batches(setup, range(1))
