@@ -99,39 +99,32 @@ def rotated(x: Tensor, rotation: Rotation) -> Tensor:
     return (x * cos + turned * sin).to(x.dtype)
 
 
-class KeylessLinear(nn.Linear):
-    """Projects to queries, keys and values, with a bias whose third for keys counts as 0.
-
-    Source: DINOv3 release, `layers/attention.py`, mask_k_bias.
-    """
-
-    def forward(self, input: Tensor) -> Tensor:
-        """(..., d) -> (..., 3 d)."""
-        query, key, value = self.bias.chunk(3)
-        bias = torch.cat([query, torch.zeros_like(key), value])
-        return F.linear(input, self.weight, bias)
-
-
 class Attention(nn.Module):
     """Attends with several heads to all tokens.
 
         softmax(q k' / sqrt(d / heads)) v
 
-    Source: Vision Transformer, App. A; rotation of q and k: RoFormer (2021), Sec. 3.2.2.
+    Source: Vision Transformer, App. A; rotation of q and k: RoFormer (2021), Sec. 3.2.2. Without
+    `key_bias` the third of the bias for k counts as 0 (DINOv3 release, `layers/attention.py`,
+    mask_k_bias).
     """
 
     def __init__(self, dim: int, heads: int, *, key_bias: bool) -> None:
         super().__init__()
-        self.heads = heads
-        self.qkv = (nn.Linear if key_bias else KeylessLinear)(dim, 3 * dim)
+        self.heads, self.key_bias = heads, key_bias
+        self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tensor, lora: LoraProjection | None, rotation: Rotation | None) -> Tensor:
         """(N, T, d) -> (N, T, d); `lora` is added to the projections."""
-        qkv = self.qkv(x)
+        bias: Tensor = self.qkv.bias
+        if not self.key_bias:
+            query, key, value = bias.chunk(3)
+            bias = torch.cat([query, torch.zeros_like(key), value])
+        qkv = F.linear(x, self.qkv.weight, bias)
         if lora is not None:
             qkv = qkv + lora(x)
-        q, k, v = qkv.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        q, k, v = qkv.view(*x.shape[:2], 3, self.heads, -1).permute(2, 0, 3, 1, 4).unbind(0)
         if rotation is not None:
             q, k = rotated(q, rotation), rotated(k, rotation)
         out = F.scaled_dot_product_attention(q, k, v)
