@@ -44,7 +44,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     """
 
     def decorate(main: Main) -> Callable[[], None]:
-        point = Point(main)
+        point = GridPoint(main)
 
         def run(words: list[str]) -> int | None:
             check_words(words)
@@ -80,7 +80,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     return decorate
 
 
-class Point:
+class GridPoint:
     """The task function of Hydra: runs one point of a grid.
 
     A launcher that runs points in other processes, perhaps on other machines, sends a copy of it

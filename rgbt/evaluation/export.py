@@ -19,8 +19,8 @@ from rgbt.data.new_images import ToPredict, of_split
 from rgbt.engine.progress import progress
 from rgbt.evaluation.predict import Predictor
 from rgbt.exported.onnx_network import (
-    Description,
     ExportedNetwork,
+    GraphDescription,
     ScoresOfImages,
     onnx_bytes,
     require_packages,
@@ -38,7 +38,7 @@ ScoresOf = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Agreement:
     """An exported graph against the network in PyTorch, on the same images."""
 
     num_images: int
@@ -64,7 +64,7 @@ def export(
     image_hw: Hw | Literal["dynamic"] | None = None,
     num_images: int = 20,
     tolerance: float = 1e-3,
-) -> tuple[Description, Comparison, dict[Hw, int]]:
+) -> tuple[GraphDescription, Agreement, dict[Hw, int]]:
     """Write the network of `predictor` in float32, unless the graph gives other scores on the CPU.
 
     It is compared on images of its size, resized ones where there is none; a dynamic one on images
@@ -76,7 +76,7 @@ def export(
         split: whose images are compared.
         image_hw: height and width of the images; None: those of most images after the transform.
         num_images: how many images are compared, the first ones.
-        tolerance: see `Comparison.check`.
+        tolerance: see `Agreement.check`.
 
     Returns:
         what was written, the comparison, and the number of images of the split by their size.
@@ -96,7 +96,7 @@ def export(
     most = max(by_size, key=lambda hw: len(by_size[hw]))
     size = image_hw if isinstance(image_hw, tuple) else most
     graph = ScoresOfImages(session.model.cpu().float().eval(), view=predictor.view, head=head)
-    description = Description(
+    description = GraphDescription(
         network=type(session.model).__name__,
         run=session.run or session.label,
         step=session.step,
@@ -157,7 +157,7 @@ def check_out(out: Path) -> None:
 
 def compare(
     reference: ScoresOf, scores_of: ScoresOf, images: list[tuple[Tensor, Tensor]]
-) -> Comparison:
+) -> Agreement:
     """Compare the network in PyTorch with the exported graph on the same images, at least one.
 
     Of each size the first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal
@@ -178,7 +178,7 @@ def compare(
             classes = classes_of(expected)
             same += int((classes == classes_of(found)).sum())
             total += classes.numel()
-    return Comparison(len(images), difference, largest, same / total)
+    return Agreement(len(images), difference, largest, same / total)
 
 
 def only_head(predictor: Predictor, names: tuple[str, ...]) -> str | None:

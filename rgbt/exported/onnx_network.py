@@ -40,7 +40,7 @@ INPUTS = {"rgb": 3, "thermal": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Description:
+class GraphDescription:
     """The metadata of an exported network.
 
     Attributes:
@@ -74,12 +74,12 @@ class Description:
     thermal: str = "float32, (batch, 1, height, width), grey level in [0, 1]"
 
     @classmethod
-    def from_metadata(cls, path: Path, metadata: Mapping[str, str]) -> Description:
+    def from_metadata(cls, path: Path, metadata: Mapping[str, str]) -> GraphDescription:
         """Read the description in the metadata of the file `path`; InputError if there is none."""
         own = {k.removeprefix(PREFIX): v for k, v in metadata.items() if k.startswith(PREFIX)}
         try:
             text = json.dumps({key: json.loads(value) for key, value in own.items()})
-            found: Description = parse_json(text, cls)
+            found: GraphDescription = parse_json(text, cls)
         except (ValueError, RecursionError) as error:
             raise InputError(
                 f"{path} has no description of rgbt ({one_line(error)}); write the file with rgbt "
@@ -128,7 +128,7 @@ class ExportedNetwork(nn.Module):
             _check_constants(content)
             self._graph = onnxruntime.InferenceSession(content, settings, **cpu)
             metadata = self._graph.get_modelmeta().custom_metadata_map
-        self.description = made = Description.from_metadata(path, metadata)
+        self.description = made = GraphDescription.from_metadata(path, metadata)
         kind, hw = "tensor(float)", ("open", "open") if made.dynamic else made.image_hw
         wanted = {name: (kind, (channels, *hw)) for name, channels in INPUTS.items()}
         wanted["scores"] = (kind, (len(made.classes), *hw))
@@ -189,7 +189,7 @@ def require_packages() -> None:
         raise InputError(f"ONNX files require {what}; install them: pip install 'rgbt[export]'.")
 
 
-def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
+def onnx_bytes(graph: ScoresOfImages, made: GraphDescription) -> bytes:
     """Make the content of an ONNX file; the size of the batch stays open, with `dynamic` all.
 
     Whether the graph is right at other sizes than that of `made` has to be compared: what a network
@@ -250,7 +250,7 @@ def exported_network(
     graph = ScoresOfImages(network, view=view, head=None)
     with torch.no_grad():
         scores = graph(*(torch.zeros(1, channels, *image_hw) for channels in INPUTS.values()))
-    made = Description(
+    made = GraphDescription(
         network=type(network).__name__,
         classes=tuple(map(str, range(scores.shape[1]))),
         view=view,

@@ -106,7 +106,7 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
 WeightedBy = Literal["batch", "image"]
 
 
-class PseudoLabels(NamedTuple):
+class WeightedLabels(NamedTuple):
     """Holds labels of a batch, and what is logged of them; float32 in [0, 1]."""
 
     label: Tensor  # (B, H, W) int64, every pixel has a class
@@ -117,7 +117,7 @@ class PseudoLabels(NamedTuple):
 
 def pseudo_labels(
     scores: Tensor, threshold: float, weighted_by: WeightedBy, ignored: tuple[float, float]
-) -> PseudoLabels:
+) -> WeightedLabels:
     """Label every pixel with its class, weighted by the share of confident pixels.
 
         y = argmax_k p_k,   q = mean over pixels of [max_k p_k >= threshold]
@@ -139,7 +139,7 @@ def pseudo_labels(
     top, bottom = (round(share * height) for share in ignored)
     counted = (rows >= top) & (rows < height - bottom)
     weights = (weight[:, None, None] * counted[:, None]).expand(label.shape)
-    return PseudoLabels(label, weights.contiguous(), of_batch, mean_count(confidence.mean()))
+    return WeightedLabels(label, weights.contiguous(), of_batch, mean_count(confidence.mean()))
 
 
 # Input of a discriminator, derived from a prediction.

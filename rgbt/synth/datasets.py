@@ -21,7 +21,7 @@ from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900, Bags
 from rgbt.ranges import Names, Seed, Text
 from rgbt.synth.camera import Floats
-from rgbt.synth.export import Images, Layout, Plan, Shot, exported
+from rgbt.synth.export import Images, Layout, ScenePlan, Shot, exported
 from rgbt.synth.factors import (
     EgoMotion,
     ForwardMetres,
@@ -94,7 +94,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
         raise InputError("dataset.ego_yaw_deg requires dataset.ego_forward_m (0: on the spot).")
     motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
     numbers = {"train": num_train, "val": num_val, "test": num_test}
-    plan = Plan(name=name, seed=seed, numbers=numbers, factors=factors, motion=motion)
+    plan = ScenePlan(name=name, seed=seed, numbers=numbers, factors=factors, motion=motion)
     folder = exported(MFNET_LAYOUT, plan, cache_dir)
     return SceneDataset(str(folder), name=name, num_classes=num_classes)
 
@@ -172,7 +172,7 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     Where absent classes count as 0, no network scores more than 14 / 19 = 73.7 % (`kp_ids`).
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
-    plan = Plan(name="synth_kp", seed=seed, numbers=numbers, factors=factors)
+    plan = ScenePlan(name="synth_kp", seed=seed, numbers=numbers, factors=factors)
     return KP(str(exported(KP_LAYOUT, plan, cache_dir)), name=plan.name, num_classes=num_classes)
 
 
@@ -259,7 +259,7 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     (about 1 % of the pixels each). ``val_bags=()`` leaves the scenes for validation in training.
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
-    plan = Plan(name="synth_pst900", seed=seed, numbers=numbers, factors=factors)
+    plan = ScenePlan(name="synth_pst900", seed=seed, numbers=numbers, factors=factors)
     folder = str(exported(PST900_LAYOUT, plan, cache_dir))
     return PST900(folder, name=plan.name, num_classes=num_classes, val_bags=val_bags)
 
@@ -331,7 +331,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     """
     numbers = {"train_day": num_train_day, "train_night": num_train_night}
     numbers |= {"val": num_val, "test": num_test}
-    plan = Plan(name="synth_freiburg", seed=seed, numbers=numbers, factors=factors)
+    plan = ScenePlan(name="synth_freiburg", seed=seed, numbers=numbers, factors=factors)
     return Freiburg(
         str(exported(FREIBURG_LAYOUT, plan, cache_dir)),
         name=plan.name,

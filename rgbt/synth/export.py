@@ -44,7 +44,7 @@ FRAMES = "next"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class ScenePlan:
     """Describes a data set: scenes by split, motion to a second frame; equal plans, equal files."""
 
     name: str
@@ -78,7 +78,7 @@ class Layout(NamedTuple):
     lists: Callable[[Shot], dict[str, str]] | None = None
 
 
-def shots_of(layout: Layout, plan: Plan) -> list[Shot]:
+def shots_of(layout: Layout, plan: ScenePlan) -> list[Shot]:
     """Return every scene of a data set, in the order of their numbers; none is in two splits."""
     shots: list[Shot] = []
     for split, total in plan.numbers.items():
@@ -90,7 +90,7 @@ def shots_of(layout: Layout, plan: Plan) -> list[Shot]:
     return shots
 
 
-def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
+def exported(layout: Layout, plan: ScenePlan, cache_dir: str | Path | None) -> Path:
     """Return the folder of a data set, written now if it is not there yet.
 
     It is renamed when complete, so that an interrupted generation leaves nothing and two cannot
@@ -119,7 +119,7 @@ def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     return folder
 
 
-def write(layout: Layout, plan: Plan, folder: Path) -> None:
+def write(layout: Layout, plan: ScenePlan, folder: Path) -> None:
     """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
     shots = shots_of(layout, plan)
     work = partial(write_shot, layout, plan, folder)
@@ -135,7 +135,7 @@ def write(layout: Layout, plan: Plan, folder: Path) -> None:
             (root / path).write_text("".join(sorted(lines)), encoding="utf-8")
 
 
-def write_shot(layout: Layout, plan: Plan, folder: Path, shot: Shot) -> None:
+def write_shot(layout: Layout, plan: ScenePlan, folder: Path, shot: Shot) -> None:
     """Render and write one scene, with its second frame where the plan has a motion."""
     factors = replace(plan.factors, night_share=float(shot.night))
     if plan.motion is None:

@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, RunError
-from rgbt.config.command import Main, Point, command
+from rgbt.config.command import GridPoint, Main, command
 from tests.commands import Call
 
 GRID = ("-m", "hydra/launcher=basic", "hydra/sweeper=basic")
@@ -63,7 +63,7 @@ def test_point_that_fails_in_another_process_raises(
     seed: int, kind: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RGBT_CONF", "")  # which reading the copy sets
-    point = Point(failing)
+    point = GridPoint(failing)
     codes = point.begin()
     copy = pickle.loads(pickle.dumps(point))
     config = OmegaConf.create({"seed": seed})
@@ -93,7 +93,7 @@ def test_point_that_is_read_elsewhere_can_compose_there(
 ) -> None:
     monkeypatch.setenv("RGBT_CONF", "/my/conf")
     main: Main = failing
-    (tmp_path / "point").write_bytes(pickle.dumps(Point(main)))
+    (tmp_path / "point").write_bytes(pickle.dumps(GridPoint(main)))
     monkeypatch.delenv("RGBT_CONF")
     paths = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     done = subprocess.run(

@@ -21,11 +21,11 @@ from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import available, compose
 from rgbt.evaluation import export as exporting
-from rgbt.evaluation.export import Comparison, compare, only_head, other_sizes
+from rgbt.evaluation.export import Agreement, compare, only_head, other_sizes
 from rgbt.evaluation.predict import heads_of
 from rgbt.exported.onnx_network import (
-    Description,
     ExportedNetwork,
+    GraphDescription,
     ScoresOfImages,
     exported_network,
     onnx_bytes,
@@ -236,12 +236,12 @@ def test_a_comparison_counts_the_largest_difference_and_equal_classes() -> None:
         return found
 
     # Groups of one, two and one image: one of eight pixels has class 1 (4.5) for class 0 (4).
-    assert compare(reference, other, images) == Comparison(4, 2.5, 4.0, 7 / 8)
-    assert compare(reference, reference, images) == Comparison(4, 0.0, 4.0, 1.0)
-    Comparison(1, 0.004, 4.0, 0.9995).check(1e-3)
+    assert compare(reference, other, images) == Agreement(4, 2.5, 4.0, 7 / 8)
+    assert compare(reference, reference, images) == Agreement(4, 0.0, 4.0, 1.0)
+    Agreement(1, 0.004, 4.0, 0.9995).check(1e-3)
     for difference, equal in ((0.0041, 1.0), (0.0, 0.9985), (float("nan"), 1.0)):
         with pytest.raises(ValueError, match="no file was written"):
-            Comparison(1, difference, 4.0, equal).check(1e-3)
+            Agreement(1, difference, 4.0, equal).check(1e-3)
 
 
 def test_size_is_that_of_most_images(
@@ -294,7 +294,7 @@ def test_dynamic_graph_is_compared_at_other_sizes(name: str, is_right: bool) -> 
     torch.manual_seed(0)
     network = build(compose([f"model={name}", "model.num_classes=9"]).model).eval()
     graph = ScoresOfImages(network, view=record_of(network, NetworkRecord).views[0], head=None)
-    made = Description(
+    made = GraphDescription(
         network=name,
         classes=tuple("abcdefghi"),
         view=record_of(network, NetworkRecord).views[0],
@@ -336,7 +336,7 @@ def test_a_network_that_reads_values_is_refused_with_advice() -> None:
             del views
             return Output(rgb if float(thermal.sum()) > 1 else thermal, {})
 
-    made = Description(
+    made = GraphDescription(
         network="Branching",
         classes=("a",),
         view="rgbt",

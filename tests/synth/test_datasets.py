@@ -32,7 +32,7 @@ from rgbt.synth.datasets import (
     seen_in_thermal,
     synth,
 )
-from rgbt.synth.export import Layout, Plan, exported, shots_of, write
+from rgbt.synth.export import Layout, ScenePlan, exported, shots_of, write
 from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.scene import render_pair, render_scene
 from rgbt.synth.street import INDEX, Table
@@ -44,8 +44,10 @@ FREIBURG_FACTORS = SceneFactors(height=98, width=288, field_of_view_deg=96.0)
 EMPTY = Layout(lambda shots: shots, lambda scene, shot: {})
 
 
-def planned(name: str, numbers: dict[str, int] = NUMBERS, factors: SceneFactors = SMALL) -> Plan:
-    return Plan(name=name, seed=0, numbers=numbers, factors=factors)
+def planned(
+    name: str, numbers: dict[str, int] = NUMBERS, factors: SceneFactors = SMALL
+) -> ScenePlan:
+    return ScenePlan(name=name, seed=0, numbers=numbers, factors=factors)
 
 
 class Embedded(NamedTuple):
@@ -54,7 +56,7 @@ class Embedded(NamedTuple):
     layout: Layout
     reader: Callable[[str], Any]
     background: tuple[str, ...]
-    plan: Plan
+    plan: ScenePlan
 
     def made(self, cache_dir: Path, **changes: Any) -> Any:
         numbers = {f"num_{split}": number for split, number in self.plan.numbers.items()}
@@ -198,7 +200,7 @@ def test_interrupted_generation_leaves_nothing(
 ) -> None:
     embedded, real = EMBEDDED["synth"], export.write_shot
 
-    def interrupted(layout: Layout, plan: Plan, folder: Path, shot: Any) -> None:
+    def interrupted(layout: Layout, plan: ScenePlan, folder: Path, shot: Any) -> None:
         if shot.scene == 3:
             raise KeyboardInterrupt
         real(layout, plan, folder, shot)

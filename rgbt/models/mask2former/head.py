@@ -462,7 +462,7 @@ def mask_embed(dim: int) -> nn.Sequential:
     return nn.Sequential(OrderedDict(layers=nn.Sequential(layers)))
 
 
-class Predictor(nn.Module):
+class QueryDecoder(nn.Module):
     """Decodes queries, with a prediction before the first and after every layer.
 
     Layer i reads level i mod 3 (strides 32, 16, 8).   Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).

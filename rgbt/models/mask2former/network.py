@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
-from rgbt.models.mask2former.head import GROUPS, HeadShape, PixelDecoder, Predictor
+from rgbt.models.mask2former.head import GROUPS, HeadShape, PixelDecoder, QueryDecoder
 from rgbt.models.parts import check_heads
 from rgbt.ranges import Channels
 from rgbt.requirements import NetworkRecord
@@ -110,7 +110,7 @@ class MaskNetwork(nn.Module):
         self.backbone = backbone
         pixel_decoder = PixelDecoder(self.backbone.norm_layers.widths, shape)
         self.sem_seg_head = nn.ModuleDict(
-            {"pixel_decoder": pixel_decoder, "predictor": Predictor(shape)}
+            {"pixel_decoder": pixel_decoder, "predictor": QueryDecoder(shape)}
         )
         self.inputs = inputs
 
