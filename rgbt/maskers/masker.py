@@ -47,7 +47,7 @@ class Masker:
     Its width: ``sigma_p = N_y / sigma_div`` cells. Whether N_y counts the rows of the image or of
     the crop is open in the paper; the release takes the padded crop (`sigma_height: null`).
 
-    The settings are the keys of ``conf/masker/grbm_released.yaml``.
+    The settings are the keys of ``conf/masker/grbm.yaml``.
 
     Attributes:
         sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "square" one
