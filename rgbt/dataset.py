@@ -102,18 +102,6 @@ class DatasetWrapper:
         return getattr(self.source, key)
 
 
-class Subset(DatasetWrapper):
-    """A data set of which only the images `chosen` are read, whatever the split."""
-
-    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
-        super().__init__(source)
-        self._chosen = chosen
-
-    def names(self, split: str) -> tuple[str, ...]:  # noqa: ARG002 - as every data set
-        """Return the chosen names."""
-        return self._chosen
-
-
 def background_indices(dataset: LabelledDataset) -> tuple[int, ...]:
     """Return the class indices of `LabelledDataset.background`."""
     return tuple(dataset.classes.index(name) for name in dataset.background)

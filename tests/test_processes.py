@@ -194,7 +194,7 @@ def loaded(root: Path) -> dict[str, Any]:
     pairs = PairedBatches(*train, first=1, per_step=1)
     return {
         "train": [batch for pair in pairs for batch in (pair.source, pair.target)],
-        "eval": [batch.name for batch in eval_batches(dataset, "val", crm(), given)],
+        "eval": [batch.name for batch in eval_batches(dataset, dataset.names("val"), crm(), given)],
         "uneven": is_refused(lambda: train_batches(dataset, "train", crm(), uneven, 0, range(1))),
     }
 

@@ -289,13 +289,15 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
 
 
 def eval_batches(
-    dataset: LabelledDataset, split: str, transform: Transform, settings: LoaderSettings
+    dataset: LabelledDataset,
+    names: tuple[str, ...],
+    transform: Transform,
+    settings: LoaderSettings,
 ) -> Batches:
-    """Load every sample of the split once, in the order of its list, by ``transform.test``.
+    """Load the samples called `names` once, in this order, by ``transform.test``.
 
     Process r of W has the batches r, r + W, r + 2 W, ..., possibly none.
     """
-    names = dataset.names(split)
     source = Examples(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     keys = [list(names[start : start + size]) for start in range(0, len(names), size)]

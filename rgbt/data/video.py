@@ -27,7 +27,7 @@ from rgbt.data.patterns import (
     without_rgb,
 )
 from rgbt.data.thermal import ThermalRange
-from rgbt.dataset import DatasetWrapper, LabelledDataset, reader_of
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
 
@@ -341,47 +341,33 @@ class MVSeg(VideoDataset):
         self.add(frames, partners, lists, gaps)
 
 
-class FramesInOrder(DatasetWrapper):
-    """Names all frames of the sequences of `split`, instead of the labelled ones of a list.
+def frames_in_order(dataset: LabelledDataset, split: str) -> Sequences:
+    """Return the names of all frames of the sequences of a split, labelled or not, in order.
 
-    Attributes:
-        sequences: names of each sequence, in the order of their frames; two or more each.
-        alone: number of frames without a neighbour, which are left out.
-
-    Raises:
-        InputError: no two frames of the split follow each other.
+    A frame without a neighbour is in none of them. InputError: no two frames follow each other.
     """
+    reader = reader_of(dataset)
+    if isinstance(reader, VideoDataset):
+        every = reader.sequences(split)
+    else:
+        every = sequences_of_names(dataset.names(split))
+    sequences = tuple(sequence for sequence in every if len(sequence) > 1)
+    if not sequences:
+        raise InputError(
+            f"split '{split}' of {dataset.name} has no two consecutive frames among its "
+            f"{len(every)} frame(s); frames=video requires names whose numbers follow each "
+            "other, such as 00101D and 00102D."
+        )
+    return sequences
 
-    def __init__(self, source: LabelledDataset, split: str) -> None:
-        super().__init__(source)
-        reader = reader_of(source)
-        if isinstance(reader, VideoDataset):
-            every = reader.sequences(split)
-        else:
-            every = sequences_of_names(source.names(split))
-        self.sequences = tuple(sequence for sequence in every if len(sequence) > 1)
-        self.alone = len(every) - len(self.sequences)
-        if not self.sequences:
-            raise InputError(
-                f"split '{split}' of {source.name} has no two consecutive frames among its "
-                f"{self.alone} frame(s); frames=video requires names whose numbers follow each "
-                "other, such as 00101D and 00102D."
-            )
-        self._frames = tuple(name for sequence in self.sequences for name in sequence)
-        self._split = split
 
-    @property
-    def pairs(self) -> dict[str, str]:
-        """Return the frame before each second frame."""
-        before: dict[str, str] = {}
-        for sequence in self.sequences:
-            for name, later in pairwise(sequence):
-                before[later] = name
-        return before
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Return all frames in order; of another split as the source has them."""
-        return self._frames if split == self._split else self.source.names(split)
+def frames_before(sequences: Sequences) -> dict[str, str]:
+    """Return the frame before each frame but the first ones, by name, in order."""
+    before: dict[str, str] = {}
+    for sequence in sequences:
+        for name, later in pairwise(sequence):
+            before[later] = name
+    return before
 
 
 def sequences_of_names(names: Iterable[str]) -> Sequences:

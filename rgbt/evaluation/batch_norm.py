@@ -20,7 +20,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import LabelledDataset, Subset
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.progress import progress
 from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement
@@ -144,9 +144,8 @@ def _pass(session: Session, predictor: Predictor, names: Names) -> Names:
     """Predict images without using the predictions; the names of those that cannot be read."""
     from rgbt.data.pseudo_labels import Unlabelled  # the statistics are rarely computed again
 
-    batches = eval_batches(
-        Unlabelled(Subset(session.dataset, names)), "", session.transform, session.loading
-    )
+    images = Unlabelled(session.dataset)
+    batches = eval_batches(images, names, session.transform, session.loading)
     with progress() as display:
         task = display.add_task("statistics", total=len(names), note="images")
         for batch in batches:

@@ -167,7 +167,7 @@ def _predict(
 ) -> dict[str, Any]:
     """Predict and write all images of the split; the part of the manifest that counts them."""
     names = session.dataset.names(wanted.split)
-    batches = eval_batches(session.dataset, wanted.split, session.transform, session.loading)
+    batches = eval_batches(session.dataset, names, session.transform, session.loading)
     head: Any = wanted.head or None
     predictor = Predictor(session, wanted.view, head)  # type: ignore[arg-type]
     digest = hashlib.sha256()

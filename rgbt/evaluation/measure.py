@@ -20,7 +20,7 @@ from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import AS_TRAINED
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import KnownScenes, LabelledDataset, Subset, reader_of
+from rgbt.dataset import KnownScenes, LabelledDataset, reader_of
 from rgbt.engine.memory import naming_memory
 from rgbt.engine.progress import progress
 from rgbt.evaluation.batch_norm import normalised, parts_of_split
@@ -218,9 +218,8 @@ def _predicted(
         return classes.cpu(), list(confidence.cpu())
 
     for names, sources in parts_of_split(session.dataset, wanted):
-        images = Subset(session.dataset, names)
         with normalised(session, predictor, wanted, sources) as unmeasured:
-            batches = eval_batches(images, wanted.split, session.transform, session.loading)
+            batches = eval_batches(session.dataset, names, session.transform, session.loading)
             for loaded in shown(batches, wanted.split, len(names)):
                 batch = predictor.counted(loaded)
                 classes, confidences = predict(batch.to(session.device))

@@ -62,7 +62,9 @@ def measured(case: Case, folder: Path) -> tuple[float, float]:
     words = [*case.overrides, *sizes, f"dataset.num_test={case.images}"]
     words += [f"runs_dir={folder}", f"data.cache={folder / 'decoded'}", "tracking=none"]
     session = open_session(specify(compose(words), words), load_weights=False)
-    batches = eval_batches(session.dataset, "test", session.transform, session.loading)
+    batches = eval_batches(
+        session.dataset, session.dataset.names("test"), session.transform, session.loading
+    )
     in_memory = [batch.to(session.device) for batch in batches]
 
     def forward() -> None:

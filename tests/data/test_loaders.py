@@ -66,7 +66,7 @@ def trained(
 
 
 def evaluated(dataset: MFNet, **changes: object) -> Batches:
-    return eval_batches(dataset, "val", crm(test_short_edge=12), settings(**changes))
+    return eval_batches(dataset, dataset.names("val"), crm(test_short_edge=12), settings(**changes))
 
 
 def paired(
@@ -149,7 +149,7 @@ def test_sizes_that_differ(dataset: MFNet, expected_pair, png) -> None:
     png(dataset.files(NAMES[1])[0], np.dstack([rgb, thermal]))
     png(dataset.files(NAMES[1])[-1], label)
     whole = crm(sizes=None, crop_hw=None)
-    said = refused(lambda: next(eval_batches(dataset, "val", whole, settings())))
+    said = refused(lambda: next(eval_batches(dataset, dataset.names("val"), whole, settings())))
     assert "24x32 ('00001N') and 20x32 ('00002D'); set data.eval_batch_size=1" in said
     assert len(list(evaluated(dataset, eval_batch_size=1))) == 5
     batches = train_batches(dataset, "train", whole, settings(), 0, range(2))

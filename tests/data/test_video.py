@@ -13,7 +13,7 @@ from PIL import Image
 
 from rgbt.data.check import check_dataset
 from rgbt.data.mfnet import MFNet
-from rgbt.data.video import FramesInOrder, MVSeg, consecutive, sequences_of_names
+from rgbt.data.video import MVSeg, consecutive, frames_before, frames_in_order, sequences_of_names
 from tests.conftest import write_data, write_png
 from tests.data.layouts import (
     CLASSES,
@@ -164,16 +164,15 @@ def test_every_fifth_frame_is_a_sequence_too() -> None:
 
 def test_frames_of_a_split_in_order(tmp_path: Path) -> None:
     names = ["00003D", "00001D", "00002D", "00007D", "00001N", "00002N"]
-    found = FramesInOrder(MFNet(str(write_data(tmp_path / "a", {"test": names}, HW))), "test")
-    assert found.names("test") == ("00001D", "00002D", "00003D", "00001N", "00002N")
-    assert found.pairs == {"00002D": "00001D", "00003D": "00002D", "00002N": "00001N"}
-    assert found.alone == 1
-    assert found.read("00002D").name == "00002D"
+    found = frames_in_order(MFNet(str(write_data(tmp_path / "a", {"test": names}, HW))), "test")
+    assert found == (("00001D", "00002D", "00003D"), ("00001N", "00002N"))
+    before = frames_before(found)
+    assert before == {"00002D": "00001D", "00003D": "00002D", "00002N": "00001N"}
     dataset = video(write_videos(tmp_path / "b"))  # whose frames need no label
     assert dataset.names("test") == ("x_2", "y_9")
-    found = FramesInOrder(dataset, "test")
-    assert found.names("test") == ("x_1", "x_2", "x_3", "y_8", "y_9", "y_10")
-    assert found.pairs == {"x_2": "x_1", "x_3": "x_2", "y_9": "y_8", "y_10": "y_9"}
+    found = frames_in_order(dataset, "test")
+    assert found == (("x_1", "x_2", "x_3"), ("y_8", "y_9", "y_10"))
+    assert frames_before(found) == {"x_2": "x_1", "x_3": "x_2", "y_9": "y_8", "y_10": "y_9"}
     alone = MFNet(str(write_data(tmp_path / "c", {"test": ["00001D"]}, HW)))
-    said = refused(lambda: FramesInOrder(alone, "test"))
+    said = refused(lambda: frames_in_order(alone, "test"))
     assert "no two consecutive frames among its 1 frame(s)" in said

@@ -217,7 +217,9 @@ def test_images_that_cannot_be_read(root: Path, tmp_path: Path) -> None:
 
 
 def test_probabilities_at_the_size_of_the_label(session: Session) -> None:
-    batches = eval_batches(session.dataset, "train", session.transform, session.loading)
+    batches = eval_batches(
+        session.dataset, session.dataset.names("train"), session.transform, session.loading
+    )
     full = next(iter(batches)).to("cpu")
 
     def probabilities(model: nn.Module, batch: Batch, view: View = "rgbt") -> Tensor:

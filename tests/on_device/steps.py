@@ -70,7 +70,9 @@ def classes(setup: TrainingSetup) -> list[Tensor]:
     """Classes of every pixel of the test split, on the CPU, of the network as it was drawn."""
     session = replace(setup.session, model=setup.model)
     predictor = Predictor(session)
-    batches = eval_batches(session.dataset, "test", session.transform, session.loading)
+    batches = eval_batches(
+        session.dataset, session.dataset.names("test"), session.transform, session.loading
+    )
     return [predictor.classes(batch.to(session.device)).cpu() for batch in batches]
 
 

@@ -41,8 +41,7 @@ NOT_OF_A_RECIPE = {
     "starts of scale=bench": "experiment/start",
     "scale=real, whose networks and lists are ours": "scale/real dataset/mfnet200 dataset/crack332 "
     "model/mask2former_lite model/cmx_lite model/inputs/lite",
-    "networks of other authors": "model/external model/inputs/imagenet_449 "
-    "model/inputs/unit_three",
+    "networks of other authors": "model/external model/inputs/imagenet_449 model/inputs/unit_three",
     "data sets and losses that no paper here uses": "dataset/fmb dataset/semanticrt dataset/msrs "
     "dataset/cart loss/ohem loss/focal loss/lovasz_softmax",
     "videos, which no paper here has": "dataset/video dataset/mvseg",

@@ -22,7 +22,7 @@ from rgbt.config.overrides import composing
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import NextFrames
-from rgbt.data.video import FramesInOrder
+from rgbt.data.video import frames_before, frames_in_order
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.measure import NUM_PANELS, panel_names
 from rgbt.geometry.optical_flow import FlowSource
@@ -100,7 +100,7 @@ class FramePairs:
     def names(self) -> tuple[str, ...]:
         """Return the names of the pairs: of the first frames, in videos of the second ones."""
         if self.frames == "video":
-            return tuple(FramesInOrder(self.dataset, self.split).pairs)
+            return tuple(frames_before(frames_in_order(self.dataset, self.split)))
         return self.dataset.names(self.split)
 
     @property
@@ -178,7 +178,7 @@ def frame_pairs(pairs: FramePairs, device: torch.device) -> Iterator[PairBatch]:
         return
     dataset, views = pairs.dataset, pairs.views
     listed = dataset.names(pairs.split)
-    for batch in eval_batches(dataset, pairs.split, pairs.transform, pairs.loading):
+    for batch in eval_batches(dataset, listed, pairs.transform, pairs.loading):
         moved = batch.to(device)
         # A name that the list holds twice has the views of its first position.
         indices = [listed.index(name) for name in batch.name]
@@ -194,8 +194,10 @@ def frame_pairs(pairs: FramePairs, device: torch.device) -> Iterator[PairBatch]:
 
 def _next_frames(pairs: FramePairs, device: torch.device) -> Iterator[PairBatch]:
     dataset, after = pairs.dataset, NextFrames(pairs.dataset).dataset
-    firsts = eval_batches(dataset, pairs.split, pairs.transform, pairs.loading)
-    seconds = eval_batches(after, pairs.split, pairs.transform, pairs.loading)
+    firsts, seconds = (
+        eval_batches(images, images.names(pairs.split), pairs.transform, pairs.loading)
+        for images in (dataset, after)
+    )
     for first, second in zip_longest(firsts, seconds):
         if _shown(first) != _shown(second):
             raise InputError(

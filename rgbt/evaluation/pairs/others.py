@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from torch import Tensor
 from rgbt.checks import InputError
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.data.predictions import PredictionReader
-from rgbt.data.video import FramesInOrder
+from rgbt.data.video import frames_in_order
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.evaluation.pairs.count import CountedPairs, count_predicted, to_bytes
@@ -126,7 +127,7 @@ def count_predictions(
     InputError: predictions are missing or of other images than those of `pairs`.
     """
     if pairs.frames == "video":
-        names = FramesInOrder(pairs.dataset, pairs.split).names(pairs.split)
+        names = tuple(chain.from_iterable(frames_in_order(pairs.dataset, pairs.split)))
     else:
         wanted = list_pairs(pairs)
         pair_list.check_same(pair_list.read_list(exported), wanted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import NextFrames
-from rgbt.data.video import FramesInOrder
+from rgbt.data.video import frames_before, frames_in_order
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.pairs.frames import FramePairs, frame_pairs
 from rgbt.geometry.optical_flow import FrameFlow, frame_flow, gray_of
@@ -126,12 +127,13 @@ def _next_scenes(pairs: FramePairs, predict: Predict, device: torch.device) -> I
 def _video_scenes(pairs: FramePairs, predict: Predict, device: torch.device) -> Iterator[Scenes]:
     """Follow every pair of consecutive frames; one with too few used pixels begins triples anew."""
     assert pairs.flow is not None, "videos have an estimated flow"
-    frames = FramesInOrder(pairs.dataset, pairs.split)
-    previous_of = frames.pairs
+    sequences = frames_in_order(pairs.dataset, pairs.split)
+    previous_of = frames_before(sequences)
     before: tuple[Batch, Tensor] | None = None
     # Prediction of the frame before `before`, followed to it, and where that one shows it.
     moved: tuple[Tensor, Tensor] | None = None
-    for frame, second in _predicted(pairs, frames, predict, device):
+    names = tuple(chain.from_iterable(sequences))
+    for frame, second in _predicted(pairs, names, predict, device):
         name = frame.name[0]
         earlier, before = before, (frame, second)
         if earlier is None or earlier[0].name[0] != previous_of.get(name):
@@ -157,10 +159,10 @@ def _video_scenes(pairs: FramePairs, predict: Predict, device: torch.device) -> 
 
 
 def _predicted(
-    pairs: FramePairs, frames: FramesInOrder, predict: Predict, device: torch.device
+    pairs: FramePairs, names: tuple[str, ...], predict: Predict, device: torch.device
 ) -> Iterator[tuple[Batch, Tensor]]:
     """Yield every frame alone, in order, with its prediction (1, H', W')."""
-    for loaded in eval_batches(frames, pairs.split, pairs.transform, pairs.loading):
+    for loaded in eval_batches(pairs.dataset, names, pairs.transform, pairs.loading):
         batch = loaded.to(device)
         predictions = predict(batch, batch.name).cpu()
         for at, name in enumerate(batch.name):
