@@ -47,7 +47,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> None:
+def on_page_markdown(_markdown: str, *, page: Page, **_: Any) -> None:
     """Let the search prefer pages that answer a question to long lists that hold every word."""
     uri = page.file.src_uri
     made = uri.startswith(("results/", "reference/configuration/"))

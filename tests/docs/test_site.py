@@ -65,8 +65,8 @@ BOTTOM = """(view, root) => Math.max(...[...root.querySelectorAll("article > *")
 
 RESULTS = """async (view, root) => {
   for (let n = 0; n < 600; n++) {
-    const links = [...root.querySelectorAll("a.md-search-result__link")];
-    if (links.length) return links.map(link => new URL(link.href).pathname);
+    const items = [...root.querySelectorAll(".md-search-result__item")];
+    if (items.length) return items.map(item => new URL(item.querySelector("a").href).pathname);
     await new Promise(done => setTimeout(done, 100));
   }
   return [];
