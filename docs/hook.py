@@ -11,6 +11,7 @@ from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -44,3 +45,11 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     for path, text in generated_pages().items():
         files.append(File.generated(config, path, content=text))
     return files
+
+
+def on_page_markdown(_markdown: str, *, page: Page, **_: Any) -> None:
+    """Let the search prefer pages that answer a question to long lists that hold every word."""
+    uri = page.file.src_uri
+    made = uri.startswith(("results/", "reference/configuration/"))
+    guide = uri.startswith(("tutorials/", "how-to/"))
+    page.meta["search"] = {"boost": 0.2 if made else 3 if guide else 1}

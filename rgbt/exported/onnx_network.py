@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import logging
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -182,7 +183,9 @@ class ExportedNetwork(nn.Module):
 
 
 def require_packages() -> None:
-    """Refuse where packages of the extra are missing; InputError names them."""
+    """Call before onnxruntime is imported; InputError names missing packages of the extra."""
+    # Without this, importing it stores an identifier in the home folder and sends usage data.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         what = ", ".join(missing)

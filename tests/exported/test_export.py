@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -346,3 +349,11 @@ def test_a_network_that_reads_values_is_refused_with_advice() -> None:
     )
     with pytest.raises(ValueError, match=r"Branching cannot be exported .* x\.shape\[0\]"):
         onnx_bytes(ScoresOfImages(Branching(), view="rgbt", head=None), made)
+
+
+def test_onnxruntime_stores_and_sends_nothing(tmp_path: Path) -> None:
+    code = "from rgbt.exported import onnx_network as n; n.require_packages(); import onnxruntime"
+    suppressing = ("CI", "PYTEST", "GITHUB", "TF_BUILD", "ORT_", "XDG_")  # it is quiet in tests
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(suppressing)}
+    subprocess.run([sys.executable, "-c", code], env=kept | {"HOME": str(tmp_path)}, check=True)
+    assert not [*tmp_path.rglob("deviceid")]
