@@ -71,11 +71,12 @@ def main(options: Options, overrides: list[str]) -> int:
     if bool(options.rgb) != bool(options.thermal) or bool(options.rgb) == bool(overrides):
         raise InputError("expected either dataset=... or both rgb=VIDEO and thermal=VIDEO.")
     if options.rgb and options.thermal:
-        films = (
-            two_videos.opened("rgb", options.rgb, options.rgb_fps),
-            two_videos.opened("thermal", options.thermal, options.thermal_fps),
+        rates = (
+            two_videos.rate_of("rgb", options.rgb, options.rgb_fps),
+            two_videos.rate_of("thermal", options.thermal, options.thermal_fps),
         )
-        print(two_videos.pair_videos(*films, options.offset_s, options.out))
+        films = options.rgb, options.thermal
+        print(two_videos.pair_videos(*films, rates, options.offset_s, options.out))
         return 0
     if options.matrix and options.points:
         raise InputError("expected one of matrix and points.")

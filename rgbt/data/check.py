@@ -26,11 +26,11 @@ from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
 from rgbt.cores import usable_cores
-from rgbt.data.file_dataset import FileDataset, SplitNames
+from rgbt.data.file_dataset import FileDataset, SplitNames, evenly_spaced
 from rgbt.data.images import PairReader
 from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
-from rgbt.geometry.alignment import GRID, estimated, grid_of, moved, root_mean_square, sampled
+from rgbt.geometry.alignment import GRID, estimated, grid_of, moved, root_mean_square
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
@@ -123,7 +123,7 @@ def misalignment(dataset: FileDataset, report: DatasetReport) -> str:
     if not sizes or min(hw := sizes.most_common(1)[0][0]) < SMALLEST_ALIGNED:
         return ""
     pairs = []
-    for name in sampled(names, ALIGNED_PAIRS):
+    for name in evenly_spaced(names, ALIGNED_PAIRS):
         with suppress(InputError):  # it is among the problems
             sample = dataset.pair(name)
             if sample.thermal.shape == hw:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -136,8 +136,8 @@ class FileDataset:
 
     def _found_range(self) -> Range:
         """Return percentiles of thermal values of the split train; InputError: values of a mix."""
-        names, images, errors = self.names("train"), {}, []
-        for name in names[:: -(-len(names) // MOST_IMAGES)]:
+        images, errors = {}, []
+        for name in evenly_spaced(self.names("train"), MOST_IMAGES):
             try:
                 rgb, thermal = (within(path, self.root) for path in self.frame(name)[2:4])
                 stored = read_packed(rgb, "")[1] if rgb == thermal else self.images.values(thermal)
@@ -311,6 +311,11 @@ class FileDataset:
     def own_notes(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
         """Return further remarks."""
         return []
+
+
+def evenly_spaced(names: Sequence[str], number: int) -> list[str]:
+    """Take at most `number` of the names at equal distances, the first and the last included."""
+    return [names[i] for i in np.linspace(0, len(names) - 1, min(number, len(names))).astype(int)]
 
 
 def hash_of_files(splits: SplitNames, files: Callable[[str], Iterable[Path]]) -> str:

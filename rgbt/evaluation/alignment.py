@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -11,14 +12,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, RunError
-from rgbt.data.file_dataset import FileDataset
+from rgbt.checks import InputError, RunError, one_line
+from rgbt.data.file_dataset import FileDataset, evenly_spaced
 from rgbt.data.files import read_bytes
 from rgbt.data.folder import Folder
 from rgbt.data.images import grey
+from rgbt.data.thermal import kind_of
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
-from rgbt.files.atomic import replacing, write_atomic
+from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
 from rgbt.geometry.alignment import (
     GRID,
@@ -30,7 +32,6 @@ from rgbt.geometry.alignment import (
     moved,
     resizing,
     root_mean_square,
-    sampled,
 )
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.geometry.rig import CALIBRATION, Rig, maps_of, of_calibration, of_homography, resampled
@@ -62,7 +63,7 @@ def align(
     `from_points`, `from_pairs` and `write_aligned`, whose errors are raised.
     """
     names = [n for split in dataset.splits if dataset.has(split) for n in dataset.names(split)]
-    chosen = sampled(list(dict.fromkeys(names)), num_pairs)
+    chosen = evenly_spaced(list(dict.fromkeys(names)), num_pairs)
     found: Alignment | None = None
     if known[0] is not None:
         rig, matrix = read_rig(known[0])
@@ -72,7 +73,7 @@ def align(
     rgb, thermal = read_unaligned(dataset, chosen[0])
     if matrix is None:  # of a calibration: nearest to what the rig does
         grid = grid_of(rgb.shape[:2])
-        matrix = np.asarray(cv2.findHomography(grid, rig.to_thermal(grid))[0])
+        matrix = np.asarray(cv2.findHomography(grid, rig[0](grid))[0])
     none, unknown = np.empty((0, 2)), np.full((GRID, GRID), np.nan)
     shown = found or Alignment(matrix, none, none, unknown)
     order = np.argsort(found.scores) if found and found.scores else np.arange(len(chosen))
@@ -106,15 +107,22 @@ def read_rig(path: Path) -> tuple[Rig, Floats | None]:
         for key in ("H", *CALIBRATION):
             node = file.getNode(key)
             if not node.empty():
-                values[key] = node.real() if node.isReal() or node.isInt() else node.mat()
+                values[key] = node.mat() if node.isMap() else _numbers(node)
     except (cv2.error, SystemError) as error:
-        raise InputError(f"matrix={path}: no YAML, JSON or XML of OpenCV.") from error
+        raise InputError(f"matrix={path}: {one_line(error)}") from error
     if "H" not in values:
         return of_calibration(values), None
     matrix = np.asarray(values["H"], np.float64)
-    if matrix.shape != (3, 3):
-        raise InputError(f"matrix={path}: H has shape {matrix.shape}, expected (3, 3).")
-    return of_homography(matrix), matrix
+    if matrix.size != 9:
+        raise InputError(f"matrix={path}: H has {matrix.size} numbers, expected 9.")
+    return of_homography(matrix.reshape(3, 3)), matrix.reshape(3, 3)
+
+
+def _numbers(node: cv2.FileNode) -> list[float]:
+    """Return a number, or those of lists in lists, row by row."""
+    if not node.isSeq():
+        return [node.real()]
+    return [number for index in range(node.size()) for number in _numbers(node.at(index))]
 
 
 def from_points(path: Path) -> Alignment:
@@ -122,21 +130,20 @@ def from_points(path: Path) -> Alignment:
 
     The columns are x and y in RGB, x and y in thermal; a first line of names may be there.
     """
-    rows: list[list[float]] = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8-sig", "replace").splitlines()):
-        try:
-            row = [float(word) for word in line.split(",")] if line.strip() else []
-        except ValueError as error:
-            if number:
-                raise InputError(f"points={path}, line {number + 1}: '{line}'.") from error
-            continue
-        if len(row) not in (0, 4) or not np.isfinite(row).all():
-            raise InputError(f"points={path}, line {number + 1}: expected four numbers, '{line}'.")
-        rows += [row] if row else []
-    points = np.array(rows, np.float64).reshape(-1, 4)
-    matrix = cv2.findHomography(points[:, :2], points[:, 2:])[0] if len(points) >= 4 else None
-    if matrix is None:
-        raise InputError(f"points={path}: expected four pairs or more, not on one line.")
+    text = read_bytes(path).decode("utf-8-sig", "replace")
+    has_names = text.lstrip(" \"'")[:1].isalpha()
+    try:
+        points = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=int(has_names), ndmin=2)
+    except ValueError as error:
+        raise InputError(f"points={path}: {one_line(error)}") from error
+    matrix = None
+    if points.shape[0] >= 4 and points.shape[1] == 4 and np.isfinite(points).all():
+        matrix = cv2.findHomography(points[:, :2], points[:, 2:])[0]
+    if matrix is None or np.linalg.matrix_rank(matrix) < 3:
+        raise InputError(
+            f"points={path}: expected four lines or more of four numbers, and points that are not "
+            "on one line."
+        )
     unknown = np.full((GRID, GRID), np.nan)
     return Alignment(np.asarray(matrix, np.float64), points[:, :2], points[:, 2:], unknown)
 
@@ -201,25 +208,26 @@ def write_aligned(  # noqa: PLR0913 - what is written, and how
         {path.parent.resolve() for path in dataset.files(name)} & _folders(out) for name in names
     ):
         raise InputError(f"out={out} holds the input images; choose another folder.")
-    labelled, kinds = set[str](), set[str]()
+    labelled, dtypes = set[str](), set[str]()
     rows: dict[str, Pixels] = {}
     with progress() as display:
         task = display.add_task("aligning", total=len(names), note="images")
         for name in names:
-            files, row = _aligned(dataset, rig, name, onto, labels, is_shown=name in worst)
-            kinds.add(next(path for path in files if path.startswith("thermal"))[-3:])
-            if len(kinds) > 1:
+            images, row = _aligned(dataset, rig, name, onto, labels, is_shown=name in worst)
+            dtypes.add(kind_of(images["thermal"]))
+            if len(dtypes) > 1:
                 raise InputError(f"dataset.thermal: '{name}' is of another type than the others.")
-            for path, image in files.items():
-                _write(inside(out / path, out), image)
-            if any(path.startswith("labels") for path in files):
+            for folder, image in images.items():
+                _write(inside(out / folder / name, out), image)
+            if "labels" in images:
                 labelled.add(name)
             if row is not None:
                 rows[name] = row
             display.advance(task)
     for split, listed in split_names.items():
         write_atomic(out / f"{split}.txt", "".join(f"{name}\n" for name in listed).encode())
-    settings = _settings(dataset, out, split_names, labelled, kinds.pop())
+    kind = "npy" if dtypes == {"float"} else "png"
+    settings = _settings(dataset, out, split_names, labelled, kind)
     file = out / "conf" / "dataset" / "aligned.yaml"
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(file, yaml.safe_dump(settings, sort_keys=False).encode())
@@ -234,13 +242,15 @@ def _folders(out: Path) -> set[Path]:
 def _aligned(  # noqa: PLR0913 - one pair
     dataset: FileDataset, rig: Rig, name: str, onto: Side, labels: Side, *, is_shown: bool
 ) -> tuple[dict[str, Pixels], Pixels | None]:
-    """Return the files of one pair by their paths, and its row of the sheet, if it is shown."""
+    """Return the images of one pair by their folder, and its row of the sheet, if it is shown."""
     rgb, thermal = read_unaligned(dataset, name)
+    if thermal.dtype not in (np.uint8, np.uint16):  # PNG and OpenCV know no other whole numbers
+        thermal = thermal.astype(np.float32)
     label = dataset.label(name) if dataset.frame(name).label else None
     hw, other_hw = rgb.shape[:2], thermal.shape
-    move = rig.to_thermal
+    move = rig[0]
     if onto == "thermal":
-        hw, other_hw, move = other_hw, hw, rig.to_rgb
+        hw, other_hw, move = other_hw, hw, rig[1]
     maps, valid = maps_of(move, hw, other_hw)
     if label is not None:
         own = hw if labels == onto else other_hw
@@ -260,13 +270,12 @@ def _aligned(  # noqa: PLR0913 - one pair
     if is_shown:
         after = _shown(dataset, name, other, pair)
         row = _row(name, _shown(dataset, name, onto, pair), np.asarray(before), after)
-    kind = "npy" if pair["thermal"].dtype.kind == "f" else "png"
-    files = {
-        f"rgb/{name}.png": np.ascontiguousarray(pair["rgb"][..., ::-1]),
-        f"thermal/{name}.{kind}": pair["thermal"],
-        f"valid/{name}.png": valid.astype(np.uint8) * 255,
+    images = {
+        "rgb": np.ascontiguousarray(pair["rgb"][..., ::-1]),
+        "thermal": pair["thermal"],
+        "valid": valid.astype(np.uint8) * 255,
     }
-    return files | ({} if label is None else {f"labels/{name}.png": label}), row
+    return images | ({} if label is None else {"labels": label}), row
 
 
 def _shown(dataset: FileDataset, name: str, side: Side, pair: Mapping[str, Pixels]) -> Pixels:
@@ -313,12 +322,14 @@ def _outline(image: Pixels) -> Pixels:
 
 
 def _write(path: Path, image: Pixels) -> None:
-    if path.suffix == ".png":
-        write_png(path, image)
+    """Write path.png, or path.npy of real numbers."""
+    if image.dtype.kind != "f":
+        write_png(path.with_name(f"{path.name}.png"), image)
         return
+    content = io.BytesIO()
+    np.save(content, image)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        np.save(file, image)
+    write_atomic(path.with_name(f"{path.name}.npy"), content.getvalue())
 
 
 def _settings(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,15 +25,12 @@ SMOOTHING, NEIGHBOURHOOD = 0.7, 12.0
 # Share of the mean gradient of the image added to that of the neighbourhood: noise stays small.
 FLOOR = 0.3
 
-# Shorter edge of the images that are compared, first and last; smaller images stay as they are.
-COARSE_EDGE, MIDDLE_EDGE, FINE_EDGE = 60, 120, 240
+# Shorter edge of the images whose shift is found, and of those that are compared at last.
+COARSE_EDGE, FINE_EDGE = 60, 240
 
-# Tiles along a column and a row; the largest size of one; distance searched around it.
-TILES = (12, 16)
-TILE, REACH, FINE_REACH = 80, 8, 4
-
-# Tiles that both images have to show.
-LEAST_TILES = 40
+# Tiles along a column and a row, their size as a share of the shorter edge, and how many of them
+# both images have to show.
+TILES, TILE, LEAST_TILES = (9, 12), 1 / 3, 24
 
 # Blocks of tiles along a column and a row that the jackknife leaves out, one at a time.
 BLOCKS = (3, 4)
@@ -48,15 +45,12 @@ NEAR = 1.5
 APART = 2.0
 
 # An estimate is used if so many tiles agree, and its uncertainty is at most this share of the
-# diagonal: 1.5 pixels of 640 x 480.
-LEAST_SHARE, MOST_UNCERTAIN = 0.75, 1.5 / 800
+# diagonal: 2 pixels of 640 x 480.
+LEAST_SHARE, MOST_UNCERTAIN = 0.75, 1 / 400
 
-Stage = Literal["shift", "similarity", "homography"]
-STAGES: tuple[tuple[int, Stage, int], ...] = (
-    (MIDDLE_EDGE, "similarity", REACH),
-    (FINE_EDGE, "similarity", FINE_REACH),
-    (FINE_EDGE, "homography", FINE_REACH),
-)
+# Shorter edge, distance searched around a tile, and whether a homography is fitted: else a
+# similarity.
+STAGES = ((120, 8, False), (FINE_EDGE, 4, False), (FINE_EDGE, 4, True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +89,6 @@ class Alignment:
         if error > MOST_UNCERTAIN * float(np.hypot(*rgb_hw)):
             return f"its uncertainty is {error:.1f} px: too few pairs, no texture, or night"
         return ""
-
-
-def sampled(names: Sequence[str], number: int) -> list[str]:
-    """Take at most `number` names at even distances."""
-    return [names[i] for i in np.linspace(0, len(names) - 1, min(number, len(names))).astype(int)]
 
 
 def root_mean_square(values: Floats) -> float:
@@ -156,7 +145,7 @@ def estimated(pairs: Sequence[tuple[Image, Image]]) -> Alignment | None:
     estimate can be trusted says `Alignment.reason`.
     """
     rgb_hw, thermal_hw = pairs[0][0].shape, pairs[0][1].shape
-    small_hw = _shrunk(rgb_hw, FINE_EDGE)
+    small_hw = _with_edge(rgb_hw, FINE_EDGE)
     small = [(_resized(rgb, small_hw), _resized(thermal, small_hw)) for rgb, thermal in pairs]
     start = _shift(small)
     found = _refined(small, start, tuple(range(len(small))))
@@ -177,9 +166,8 @@ def estimated(pairs: Sequence[tuple[Image, Image]]) -> Alignment | None:
     )
 
 
-def _shrunk(hw: HW, edge: int) -> HW:
-    scale = min(1.0, edge / min(hw))
-    return round(hw[0] * scale), round(hw[1] * scale)
+def _with_edge(hw: HW, edge: int) -> HW:
+    return round(hw[0] * edge / min(hw)), round(hw[1] * edge / min(hw))
 
 
 def _resized(image: Image, hw: HW) -> Image:
@@ -191,7 +179,7 @@ def _resized(image: Image, hw: HW) -> Image:
 def _shift(pairs: Sequence[tuple[Image, Image]]) -> Floats:
     """Find the shift of whole images by the mean correlation of their edges, at a small size."""
     full_hw = pairs[0][0].shape
-    hw = _shrunk(full_hw, COARSE_EDGE)
+    hw = _with_edge(full_hw, COARSE_EDGE)
     reach = min(hw) // 5
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
     inner = np.s_[reach : hw[0] - reach, reach : hw[1] - reach]
@@ -209,8 +197,8 @@ def _refined(
 ) -> Alignment | None:
     """Refine a homography by tiles of the pairs `used`, from coarse to fine."""
     full_hw = pairs[0][0].shape
-    for edge, stage, reach in STAGES:
-        hw = _shrunk(full_hw, edge)
+    for edge, reach, is_homography in STAGES:
+        hw = _with_edge(full_hw, edge)
         size = resizing(full_hw, hw)
         local = size @ matrix @ inverse(size)
         centres, sheets = _sheets(pairs, local, hw, reach)
@@ -218,22 +206,20 @@ def _refined(
         inside = np.array([is_inside for _, is_inside in peaks], bool)
         shifts = np.array([shift for shift, _ in peaks]).reshape(-1, 2)[inside]
         points = centres[inside]
-        step, near = _fitted(points, points + shifts, stage)
+        step, near = _fitted(points, points + shifts, is_homography=is_homography)
         if step is None:
             return None
         matrix = inverse(size) @ local @ step @ size
     matrix = matrix / matrix[2, 2]
-    # The last stage is of full size: `local` took its points to thermal.
-    fitted = points[near]
-    uncertainty = _jackknife(fitted, (points + shifts)[near], full_hw)
+    uncertainty = _jackknife(points, points + shifts, full_hw)
     own = np.array([_peak(sheet)[0] for sheet in sheets.mean(1)])
     apart = np.linalg.norm(own - np.median(own[list(used)], 0), axis=1)
     outliers = tuple(np.flatnonzero(apart > APART).tolist())
     scores = tuple(float(sheet[reach, reach]) for sheet in sheets.mean(1))
     return Alignment(
         matrix,
-        fitted,
-        moved(local, (points + shifts)[near]),
+        points[near],
+        moved(local, (points + shifts)[near]),  # the last stage is of full size
         uncertainty,
         float(near.sum()) / max(len(centres), LEAST_TILES),
         scores,
@@ -248,7 +234,7 @@ def _sheets(
 
     Returns the middle of each tile, (tiles, 2), and (pairs, tiles, shifts, shifts).
     """
-    tile = min(TILE, min(hw) // 3)
+    tile = round(TILE * min(hw))
     tops, lefts = (
         np.linspace(reach, side - tile - reach, number).round().astype(int)
         for side, number in zip(hw, TILES, strict=True)
@@ -294,22 +280,17 @@ def _peak(sheet: Floats) -> tuple[Floats, bool]:
 
 
 def _fitted(
-    points: Floats, partners: Floats, stage: Stage
+    points: Floats, partners: Floats, *, is_homography: bool
 ) -> tuple[Floats | None, NDArray[np.bool_]]:
-    """Fit by RANSAC; the matrix, None without one, and which points are near it."""
-    none = np.zeros(len(points), bool)
-    if len(points) < 8:
-        return None, none
-    if stage == "similarity":
-        part, near = cv2.estimateAffinePartial2D(
-            points, partners, method=cv2.RANSAC, ransacReprojThreshold=NEAR
-        )
-        matrix = None if part is None else np.vstack([part, [0, 0, 1]])
-    else:
-        matrix, near = cv2.findHomography(points, partners, cv2.RANSAC, NEAR, maxIters=5000)
+    """Fit robustly; the matrix, None without one, and which points are near it."""
+    matrix, near = None, np.zeros(len(points), np.uint8)
+    if len(points) >= 8 and is_homography:
+        matrix, near = cv2.findHomography(points, partners, cv2.USAC_MAGSAC, NEAR)
+    elif len(points) >= 8:
+        matrix, near = cv2.estimateAffinePartial2D(points, partners, ransacReprojThreshold=NEAR)
     if matrix is None or near.sum() < 8:
-        return None, none
-    return np.asarray(matrix, np.float64), near.ravel() > 0
+        return None, np.zeros(len(points), bool)
+    return np.vstack([matrix, [0, 0, 1]])[:3], near.ravel() > 0
 
 
 def _jackknife(points: Floats, partners: Floats, hw: HW) -> Floats:
@@ -329,11 +310,9 @@ def _jackknife(points: Floats, partners: Floats, hw: HW) -> Floats:
     block = cells[1] * BLOCKS[1] + cells[0]
     for left_out in np.unique(block):
         kept = block != left_out
-        matrix = cv2.findHomography(points[kept], partners[kept])[0] if kept.sum() >= 4 else None
-        if matrix is None:
-            return np.full((GRID, GRID), np.inf)
-        results.append(moved(matrix, grid))
-    if len(results) < 4:
+        matrix, _ = _fitted(points[kept], partners[kept], is_homography=True)
+        results.append(np.full_like(grid, np.inf) if matrix is None else moved(matrix, grid))
+    if len(results) < 4 or not np.isfinite(results).all():
         return np.full((GRID, GRID), np.inf)
     spread = np.square(np.array(results) - np.mean(results, 0)).sum((0, 2))
     error = np.sqrt(spread * (len(results) - 1) / len(results))

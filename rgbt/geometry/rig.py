@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.geometry.alignment import HW, Floats, inverse, moved
+from rgbt.geometry.alignment import HW, Floats, inverse, moved, resizing
 
 # What a calibration holds: shape of each entry, None: a vector of 4, 5, 8, 12 or 14 numbers.
 CALIBRATION: dict[str, tuple[int, ...] | None] = {
@@ -29,18 +29,18 @@ CALIBRATION: dict[str, tuple[int, ...] | None] = {
 DISTORTIONS = (4, 5, 8, 12, 14)  # lengths that OpenCV reads
 
 
-class Rig(NamedTuple):
-    """Moves points of RGB to thermal, and back."""
+Move = Callable[[Floats], Floats]
+Rig = tuple[Move, Move]  # points of RGB to thermal, and back
 
-    to_thermal: Callable[[Floats], Floats]
-    to_rgb: Callable[[Floats], Floats]
+# Pixels of an image between neighbouring pixels of another, from which it is averaged first.
+COARSER = 1.5
 
 
 def of_homography(matrix: Floats) -> Rig:
     """Return the rig of a homography (3, 3); InputError if it cannot be inverted."""
     if abs(np.linalg.det(matrix)) < 1e-12 or not np.isfinite(matrix).all():
         raise InputError("matrix: H cannot be inverted.")
-    return Rig(partial(moved, matrix), partial(moved, inverse(matrix)))
+    return partial(moved, matrix), partial(moved, inverse(matrix))
 
 
 def of_calibration(values: Mapping[str, Any]) -> Rig:
@@ -74,7 +74,7 @@ def of_calibration(values: Mapping[str, Any]) -> Rig:
         scene = rays * ((distance + back[2]) / rays[:, 2:]) - back
         return np.asarray(cv2.projectPoints(scene, np.eye(3), np.zeros(3), *rgb)[0][:, 0])
 
-    return Rig(to_thermal, to_rgb)
+    return to_thermal, to_rgb
 
 
 def _rays(points: Floats, matrix: Floats, distortion: Floats) -> Floats:
@@ -82,7 +82,7 @@ def _rays(points: Floats, matrix: Floats, distortion: Floats) -> Floats:
     return np.hstack([found, np.ones((len(found), 1))])
 
 
-def maps_of(move: Callable[[Floats], Floats], hw: HW, other_hw: HW) -> tuple[Any, Any]:
+def maps_of(move: Move, hw: HW, other_hw: HW) -> tuple[Any, Any]:
     """Return where the pixels of an image (H, W) lie in the other one, and which lie inside it.
 
     The maps for `cv2.remap`, (H, W, 2) float32, and (H, W) bool.
@@ -97,8 +97,16 @@ def maps_of(move: Callable[[Floats], Floats], hw: HW, other_hw: HW) -> tuple[Any
 def resampled(
     image: NDArray[Any], maps: NDArray[np.float32], *, nearest: bool = False
 ) -> NDArray[Any]:
-    """Take an image (H', W', ...) at `maps` (H, W, 2); its border continues outside."""
-    how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-    source = image.astype(np.float32) if image.dtype.kind == "f" else image
+    """Take an image (H', W', ...) at `maps` (H, W, 2); its border continues outside.
+
+    An image of many more pixels is averaged to their size first, but for `nearest`: of its values
+    none is made.
+    """
+    how, hw = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR, image.shape[:2]
+    step = float(np.median(np.linalg.norm(np.diff(maps, axis=1), axis=2)))
+    if step > COARSER and not nearest:
+        small_hw = max(round(hw[0] / step), 1), max(round(hw[1] / step), 1)
+        image = cv2.resize(image, small_hw[::-1], interpolation=cv2.INTER_AREA)
+        maps = cv2.transform(maps, resizing(hw, small_hw)[:2])
     columns, rows = cv2.split(maps)
-    return np.asarray(cv2.remap(source, columns, rows, how, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(cv2.remap(image, columns, rows, how, borderMode=cv2.BORDER_REPLICATE))

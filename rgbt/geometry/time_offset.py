@@ -83,11 +83,9 @@ def paired(
     The partner is nearest in time, at most half a frame of the faster one away; the second video
     began `offset_s` seconds later.
     """
-    times = np.arange(numbers[0]) / rates_hz[0], np.arange(numbers[1]) / rates_hz[1] + offset_s
-    slow = 0 if rates_hz[0] <= rates_hz[1] else 1
-    pairs = []
-    for index, time in enumerate(times[slow]):
-        partner = int(np.abs(times[1 - slow] - time).argmin())
-        if abs(times[1 - slow][partner] - time) <= 0.5 / max(rates_hz) + 1e-9:
-            pairs.append((index, partner) if slow == 0 else (partner, index))
-    return pairs
+    slow = int(rates_hz[1] < rates_hz[0])
+    later_s = (-offset_s, offset_s)[slow]
+    frames = np.arange(numbers[slow])
+    partners = np.rint((frames / rates_hz[slow] + later_s) * rates_hz[1 - slow]).astype(int)
+    found = np.stack([frames, partners], 1)[(partners >= 0) & (partners < numbers[1 - slow])]
+    return [(one, other) for one, other in (found[:, ::-1] if slow else found).tolist()]

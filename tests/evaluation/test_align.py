@@ -14,7 +14,8 @@ from rgbt.align import Options, main
 from rgbt.checks import InputError, RunError
 from rgbt.config.overrides import built
 from rgbt.data.check import check_dataset, misalignment
-from rgbt.data.file_dataset import FileDataset
+from rgbt.data.file_dataset import FileDataset, evenly_spaced
+from rgbt.evaluation.alignment import read_rig
 from tests.geometry.test_alignment import scene, thermal_of
 from tests.geometry.warps import drawn_warp, mean_error
 
@@ -136,17 +137,54 @@ def test_unit_and_range_of_thermal_are_kept(
     assert (moved[:, :155] == own_levels[:, 5:]).all()
 
 
+@pytest.mark.parametrize("onto", ["rgb", "thermal"])
+def test_whole_numbers_that_a_png_cannot_hold(
+    onto: Any, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values from -3000 to 4650 of 16 bits with a sign are written as real numbers."""
+    own, out, file = tmp_path / "own", tmp_path / "out", tmp_path / "points.csv"
+    for path in list((own / "ir").iterdir()):
+        np.save(
+            path.with_suffix(".npy"), written(own, f"ir/{path.name}").astype(np.int16) * 30 - 3000
+        )
+        path.unlink()
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    given = [*words, "dataset.thermal='ir/{name}.npy'", "dataset.thermal_range=[-2500,4000]"]
+    assert main(Options(out=out, points=file, onto=onto), given) == 0
+    before, after = (
+        d.read("2").thermal for d in (built("dataset", given), aligned_set(out, monkeypatch))
+    )
+    if onto == "rgb":
+        after, before = after[:, :155], before[:, 5:]
+    assert (after == before).all()
+
+
+def test_matrix_of_plain_lists(tmp_path: Path) -> None:
+    """As Python's json writes it: OpenCV itself writes maps of rows, columns and data."""
+    file = tmp_path / "rig.json"
+    file.write_text(json.dumps({"H": [[1, 0, 2.5], [0, 1, -3], [0, 0, 1]]}))
+    (to_thermal, _), matrix = read_rig(file)
+    assert matrix is not None
+    assert np.allclose(to_thermal(np.array([[10.0, 20.0]])), [[12.5, 17]])
+
+
 def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
     file, out = tmp_path / "file", tmp_path / "out"
     for text, message in (
-        ("1,2,3,4\n", "expected four pairs or more"),
-        ("1,2,3,4\n1,2,3\n", "line 2: expected four numbers"),
-        ("1,2,3,4\n1,2,3,inf\n", "line 2: expected four numbers"),
+        ("1,2,3,4\n", "expected four lines or more"),
+        ("1,2,3,4\n1,2,3\n", "3 at row 2"),
+        ("x1,y1,x2,y2\n1,2,3,4\n1,2,3,four\n", "'four'"),
+        ("1,2,3,4\n" * 4 + "1,2,3,inf\n", "expected four lines or more"),
+        ("".join(f"{n},{n},{n},{n}\n" for n in range(5)), "not on one line"),
     ):
         file.write_text(text)
         with pytest.raises(InputError, match=message):
             main(Options(out=out, points=file), words)
-    for text, message in (("not yaml [", "no YAML"), ("%YAML:1.0\n---\na: 1\n", "'K_rgb'")):
+    for text, message in (
+        ("not yaml [", "matrix="),
+        ("%YAML:1.0\n---\na: 1\n", "'K_rgb'"),
+        ('{"H": [[1, 0], [0, 1]]}', "H has 4 numbers, expected 9"),
+    ):
         file.write_text(text)
         with pytest.raises(InputError, match=message):
             main(Options(out=out, matrix=file), words)
@@ -168,13 +206,18 @@ def test_night_without_edges_is_not_estimated(words: list[str], tmp_path: Path) 
     )
 
 
+def test_names_at_equal_distances() -> None:
+    assert evenly_spaced("abcdefg", 4) == ["a", "c", "e", "g"]
+    assert evenly_spaced("ab", 4) == ["a", "b"]
+
+
 def folder_of_frames(folder: Path, places: np.ndarray) -> None:
     """A bright square of 8 pixels at these columns."""
     folder.mkdir()
     for number, place in enumerate(places):
         image = np.zeros((48, 96), np.uint8)
         cv2.rectangle(image, (int(place), 20), (int(place) + 8, 28), 255, -1)
-        cv2.imwrite(str(folder / f"{number}.png"), image)
+        cv2.imwrite(str(folder / f"{number}.png"), np.dstack([image] * 3))
 
 
 def test_two_videos_are_paired_by_motion(tmp_path: Path, capsys: Any) -> None:
@@ -191,7 +234,8 @@ def test_two_videos_are_paired_by_motion(tmp_path: Path, capsys: Any) -> None:
     assert "40 pairs of 100 RGB frames" in said
     for number in (0, 17, 39):
         rgb, thermal = (written(out, f"{kind}/{number:06d}.png") for kind in ("rgb", "thermal"))
-        assert (rgb == thermal).all()
+        assert (rgb[..., 1] == thermal).all()
+        assert rgb.shape == (48, 96, 3)
     dataset = built(
         "dataset",
         [
@@ -203,12 +247,20 @@ def test_two_videos_are_paired_by_motion(tmp_path: Path, capsys: Any) -> None:
         ],
     )
     assert len(dataset.names("test")) == 40
+    assert dataset.read("000017").thermal.shape == (48, 96)
 
 
-def test_video_that_names_other_files_is_not_opened(tmp_path: Path) -> None:
+def test_videos_that_are_refused(tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
     film.write_text("#EXTM3U\nhttp://127.0.0.1/a.ts\n")
     with pytest.raises(InputError, match="expected a video in MP4"):
         main(Options(out=tmp_path / "out", rgb=film, thermal=film), [])
+    palette = tmp_path / "palette"
+    palette.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(palette / f"{number}.png"), np.full((48, 96, 3), (0, 90, 200), np.uint8))
+    rates: Any = {"rgb_fps": 5, "thermal_fps": 5}
+    with pytest.raises(InputError, match="channels that differ by up to 200"):
+        main(Options(out=tmp_path / "out", rgb=palette, thermal=palette, **rates), [])
     with pytest.raises(InputError, match="rgb_fps has no value"):
         main(Options(out=tmp_path / "out", rgb=tmp_path, thermal=film), [])
