@@ -36,7 +36,7 @@ from rgbt.geometry.alignment import (
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.geometry.rig import CALIBRATION, Rig, maps_of, of_calibration, of_homography, resampled
 from rgbt.metrics.metric import Regions
-from rgbt.tables import TextTable
+from rgbt.tables import TextTable, number, without_nan
 from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
 from rgbt.types import IGNORE
 
@@ -44,6 +44,8 @@ Side = Literal["rgb", "thermal"]
 Pixels = NDArray[Any]
 
 RINGS = Regions(partition="ring", regions=5, aspect="image", absent="exclude")
+
+COLUMNS = ("region", "before_px", "residual_px", "standard_error_px", "points")
 
 # Number of pairs on the sheet, width of each of its pictures, squares of a checkerboard.
 WORST, PICTURE_WIDTH, SQUARES = 10, 320, 8
@@ -79,9 +81,12 @@ def align(
     order = np.argsort(found.scores) if found and found.scores else np.arange(len(chosen))
     worst = [chosen[index] for index in order[:WORST]]
     written = write_aligned(dataset, rig, out, onto=sides[0], labels=sides[1], worst=worst)
-    table = residual_table(shown, rgb.shape[:2], thermal.shape)
-    write_matrix(out, matrix, shown, table)
-    print_rich(rich_table(table))
+    rows = residuals_by_region(shown, rgb.shape[:2], thermal.shape)
+    write_matrix(out, matrix, shown, rows)
+    texts = tuple((name, *map(number, numbers), str(points)) for name, *numbers, points in rows)
+    header = tuple(name.replace("_px", " (px)").replace("_", " ") for name in COLUMNS)
+    note = "root mean square in pixels of thermal; ring 1 is the innermost"
+    print_rich(rich_table(TextTable("Alignment", header, texts, (note,))))
     if found is not None and found.scores:
         say = f"{len(chosen)} pairs, {len(found.outliers)} outliers"
         print_rich(plain_text(f"estimated from {say}; {found.share:.0%} of the tiles agree"))
@@ -166,10 +171,11 @@ def from_pairs(dataset: FileDataset, names: Sequence[str]) -> Alignment:
     return found
 
 
-def residual_table(found: Alignment, rgb_hw: HW, thermal_hw: HW) -> TextTable:
-    """Return numbers of the whole image and of each ring of RGB, in pixels of thermal.
+def residuals_by_region(found: Alignment, rgb_hw: HW, thermal_hw: HW) -> list[tuple[Any, ...]]:
+    """Return `COLUMNS` of the whole image and of each ring of RGB; NaN where nothing is known.
 
-    Distance before, which a resize leaves; residual of the points; standard error.
+    Root mean squares in pixels of thermal: the distance that a resize leaves, the residual of the
+    points, the standard error.
     """
     grid, resize = grid_of(rgb_hw), resizing(rgb_hw, thermal_hw)
     before = np.linalg.norm(moved(found.matrix, grid) - moved(resize, grid), axis=1)
@@ -187,11 +193,8 @@ def residual_table(found: Alignment, rgb_hw: HW, thermal_hw: HW) -> TextTable:
         own = np.ones(len(found.points), bool) if ring is None else of_points == ring
         parts = before[here], found.residuals[own], found.uncertainty.ravel()[here]
         numbers = [root_mean_square(part) if part.size else np.nan for part in parts]
-        cells = ["-" if np.isnan(number) else f"{number:.2f}" for number in numbers]
-        rows.append(("image" if ring is None else f"ring {ring + 1}", *cells, str(own.sum())))
-    header = ("region", "before (px)", "residual (px)", "standard error (px)", "points")
-    note = "root mean square in pixels of thermal; ring 1 is the innermost"
-    return TextTable("Alignment", header, tuple(rows), (note,))
+        rows.append(("image" if ring is None else f"ring {ring + 1}", *numbers, int(own.sum())))
+    return rows
 
 
 def write_aligned(  # noqa: PLR0913 - what is written, and how
@@ -306,8 +309,8 @@ def _row(name: str, base: Pixels, before: Pixels, after: Pixels) -> Pixels:
         pictures.append(np.dstack([faint, green, red]))
     sheet = np.ascontiguousarray(np.hstack(pictures))
     words = (f"{name} before", "after", "edges before: RGB green, thermal red", "after")
-    for number, text in enumerate(words):
-        at = (number * PICTURE_WIDTH + 4, 12)
+    for column, text in enumerate(words):
+        at = (column * PICTURE_WIDTH + 4, 12)
         for colour, width in ((0, 3), (255, 1)):
             cv2.putText(sheet, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (colour,) * 3, width)
     return sheet
@@ -359,11 +362,14 @@ def _settings(
     }
 
 
-def write_matrix(out: Path, matrix: Floats, found: Alignment, table: TextTable) -> None:
+def write_matrix(
+    out: Path, matrix: Floats, found: Alignment, rows: Sequence[tuple[Any, ...]]
+) -> None:
     """Write alignment.yml, which `matrix` reads, and alignment.json with the numbers."""
     file = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | 16)
     file.write("H", matrix)
     write_atomic(out / "alignment.yml", file.releaseAndGetString().encode())
-    numbers = {"H": matrix.tolist(), "header": list(table.header), "rows": [*map(list, table.rows)]}
+    regions = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+    numbers = {"H": matrix.tolist(), "regions": without_nan(regions)}
     agree = {"share_of_tiles": found.share, "outliers": len(found.outliers)}
     write_json(out / "alignment.json", numbers | (agree if found.scores else {}))

@@ -16,6 +16,7 @@ from rgbt.config.overrides import built
 from rgbt.data.check import check_dataset, misalignment
 from rgbt.data.file_dataset import FileDataset, evenly_spaced
 from rgbt.evaluation.alignment import read_rig
+from rgbt.geometry.alignment import grid_of, moved
 from tests.geometry.test_alignment import scene, thermal_of
 from tests.geometry.warps import drawn_warp, mean_error
 
@@ -70,6 +71,10 @@ def test_estimated_set_is_a_data_set(
     assert "ring 5" in said
     stored = json.loads((out / "alignment.json").read_text())
     assert mean_error(np.array(stored["H"]), WARP, scene(0)) < 0.4
+    grid = grid_of((120, 160))
+    before_px = np.sqrt(np.square(moved(np.array(stored["H"]), grid) - grid).sum(1).mean())
+    assert stored["regions"][0]["before_px"] == pytest.approx(before_px)
+    assert stored["regions"][0]["points"] == sum(r["points"] for r in stored["regions"][1:])
     before = built("dataset", words)
     dataset = aligned_set(out, monkeypatch)
     assert {s: dataset.names(s) for s in ("train", "val", "test")} == {
