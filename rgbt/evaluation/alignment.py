@@ -211,12 +211,13 @@ def write_aligned(  # noqa: PLR0913 - what is written, and how
         {path.parent.resolve() for path in dataset.files(name)} & _folders(out) for name in names
     ):
         raise InputError(f"out={out} holds the input images; choose another folder.")
-    labelled, dtypes = set[str](), set[str]()
+    labelled, dtypes, seen = set[str](), set[str](), list[float]()
     rows: dict[str, Pixels] = {}
     with progress() as display:
         task = display.add_task("aligning", total=len(names), note="images")
         for name in names:
             images, row = _aligned(dataset, rig, name, onto, labels, is_shown=name in worst)
+            seen.append(float((images["valid"] > 0).mean()))
             dtypes.add(kind_of(images["thermal"]))
             if len(dtypes) > 1:
                 raise InputError(f"dataset.thermal: '{name}' is of another type than the others.")
@@ -235,7 +236,8 @@ def write_aligned(  # noqa: PLR0913 - what is written, and how
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(file, yaml.safe_dump(settings, sort_keys=False).encode())
     write_png(out / "worst.png", np.vstack([rows[name] for name in worst]))
-    return f"{len(names)} pairs, {len(labelled)} with labels"
+    shown = f"both cameras saw {np.mean(seen):.0%} of the pixels"
+    return f"{len(names)} pairs, {len(labelled)} with labels; {shown}"
 
 
 def _folders(out: Path) -> set[Path]:
@@ -255,6 +257,8 @@ def _aligned(  # noqa: PLR0913 - one pair
     if onto == "thermal":
         hw, other_hw, move = other_hw, hw, rig[1]
     maps, valid = maps_of(move, hw, other_hw)
+    if not valid.any():
+        raise InputError(f"matrix: both cameras saw no pixel of '{name}'; H is RGB to thermal.")
     if label is not None:
         own = hw if labels == onto else other_hw
         if label.shape != own:

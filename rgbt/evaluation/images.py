@@ -90,8 +90,8 @@ def batch_of(session: Session, sample: Sample) -> Batch:
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write an image of 8 or 16 bit, three channels in the order B, G, R."""
-    encoded, content = cv2.imencode(".png", image)
-    assert encoded, "images of 8 and 16 bit can be encoded"
+    assert image.dtype in (np.uint8, np.uint16), "OpenCV would write other types as 8 bits"
+    content = cv2.imencode(".png", image)[1]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, content.tobytes())
 

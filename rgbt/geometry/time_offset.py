@@ -44,16 +44,16 @@ def offset_of(first: Floats, second: Floats, rates_hz: tuple[float, float]) -> f
     correlation of both motions over the time in common, of offsets that leave `LEAST_S` seconds or
     half of the shorter video.
     """
-    series = [
-        np.interp(np.arange(0, len(values) / rate, 1 / RATE_HZ), _times(values, rate), values)
-        for values, rate in zip((first, second), rates_hz, strict=True)
-    ]
-    one, other = (np.log(values + 1e-3) for values in series)
+    import pandas as pd  # rgbt --help answers without waiting for it
+
+    one, other = (_resampled(*given) for given in zip((first, second), rates_hz, strict=True))
     least = int(max(LEAST_S * RATE_HZ, min(len(one), len(other)) / 2))
     shifts = np.arange(least - len(other), len(one) - least + 1)
     if not len(shifts):
         return None
-    found = np.array([_correlation(one, other, int(shift)) for shift in shifts])
+    fixed, places = pd.Series(one), np.arange(len(other))
+    found = np.array([fixed.corr(pd.Series(other, index=places + shift)) for shift in shifts])
+    found = np.nan_to_num(found)  # of a still part
     best = int(found.argmax())
     others = found[np.abs(shifts - shifts[best]) > APART_S * RATE_HZ]
     if found[best] < max(LEAST_CORRELATION, others.max(initial=-1.0) + MARGIN):
@@ -61,18 +61,11 @@ def offset_of(first: Floats, second: Floats, rates_hz: tuple[float, float]) -> f
     return float(shifts[best]) / RATE_HZ
 
 
-def _times(values: Floats, rate_hz: float) -> Floats:
-    """Return the middle between the two frames of each difference, seconds."""
-    return np.asarray((np.arange(len(values)) + 0.5) / rate_hz, np.float64)
-
-
-def _correlation(one: Floats, other: Floats, shift: int) -> float:
-    """Correlate what two series have in common, the second one moved by `shift` samples."""
-    start, end = max(0, shift), min(len(one), len(other) + shift)
-    a, b = one[start:end], other[start - shift : end - shift]
-    if a.std() < 1e-6 or b.std() < 1e-6:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])
+def _resampled(values: Floats, rate_hz: float) -> Floats:
+    """Return the logarithm at `RATE_HZ`; a difference is of the time between its two frames."""
+    middles = (np.arange(len(values)) + 0.5) / rate_hz
+    times = np.arange(0, len(values) / rate_hz, 1 / RATE_HZ)
+    return np.asarray(np.log(np.interp(times, middles, values) + 1e-3), np.float64)
 
 
 def paired(

@@ -69,6 +69,8 @@ def test_estimated_set_is_a_data_set(
     said = capsys.readouterr().out
     assert "estimated from 8 pairs, 0 outliers" in said
     assert "ring 5" in said
+    seen = np.mean(written(out, "valid/3.png") == 255)
+    assert f"both cameras saw {seen:.0%} of the pixels" in said
     stored = json.loads((out / "alignment.json").read_text())
     assert mean_error(np.array(stored["H"]), WARP, scene(0)) < 0.4
     grid = grid_of((120, 160))
@@ -193,6 +195,9 @@ def test_files_that_are_refused(words: list[str], tmp_path: Path) -> None:
         file.write_text(text)
         with pytest.raises(InputError, match=message):
             main(Options(out=out, matrix=file), words)
+    file.write_text('{"H": [[1, 0, 900], [0, 1, 0], [0, 0, 1]]}')
+    with pytest.raises(InputError, match="both cameras saw no pixel"):
+        main(Options(out=out, matrix=file), words)
     with pytest.raises(InputError, match="either dataset"):
         main(Options(out=out), [])
     with pytest.raises(InputError, match="holds the input images"):
