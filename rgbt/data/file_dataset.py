@@ -257,6 +257,10 @@ class FileDataset:
         """Read the images of `read` alone, without the label; InputError as there."""
         return self.images.read(name, *(within(path, self.root) for path in self.frame(name)[2:4]))
 
+    def unaligned(self, name: str) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+        """Read whole RGB (H, W, 3) and thermal values (H', W'); InputError as of `read`."""
+        return self.images.unaligned(*(within(path, self.root) for path in self.frame(name)[2:4]))
+
     def stored_hw(self, name: str) -> tuple[int, int]:
         """Return (height, width) of `read`, by the header of the RGB image; InputError without."""
         if self.images.crop is None:

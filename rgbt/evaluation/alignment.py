@@ -72,7 +72,7 @@ def align(
     else:
         found = from_pairs(dataset, chosen) if known[1] is None else from_points(known[1])
         rig, matrix = of_homography(found.matrix), found.matrix
-    rgb, thermal = read_unaligned(dataset, chosen[0])
+    rgb, thermal = dataset.unaligned(chosen[0])
     if matrix is None:  # of a calibration: nearest to what the rig does
         grid = grid_of(rgb.shape[:2])
         matrix = np.asarray(cv2.findHomography(grid, rig[0](grid))[0])
@@ -93,11 +93,6 @@ def align(
     lines = [("aligned", written), ("pictures", str(out / "worst.png"))]
     print_rich(path_lines([*lines, ("data set", f"RGBT_CONF={out / 'conf'} dataset=aligned")]))
     return 0
-
-
-def read_unaligned(dataset: FileDataset, name: str) -> tuple[Pixels, Pixels]:
-    """Read whole RGB (H, W, 3) and thermal values (H', W'); InputError as `FileDataset.read`."""
-    return dataset.images.unaligned(*dataset.frame(name)[2:4])
 
 
 def read_rig(path: Path) -> tuple[Rig, Floats | None]:
@@ -157,7 +152,7 @@ def from_pairs(dataset: FileDataset, names: Sequence[str]) -> Alignment:
     """Estimate the homography from pairs; RunError if it cannot be estimated, and why."""
     pairs: list[tuple[Pixels, Pixels]] = []
     for name in names:
-        rgb, thermal = read_unaligned(dataset, name)
+        rgb, thermal = dataset.unaligned(name)
         if pairs and (rgb.shape[:2], thermal.shape) != (pairs[0][0].shape, pairs[0][1].shape):
             raise InputError(f"dataset: '{name}' has another size than '{names[0]}'.")
         pairs.append((gray_of(rgb), thermal))
@@ -248,7 +243,7 @@ def _aligned(  # noqa: PLR0913 - one pair
     dataset: FileDataset, rig: Rig, name: str, onto: Side, labels: Side, *, is_shown: bool
 ) -> tuple[dict[str, Pixels], Pixels | None]:
     """Return the images of one pair by their folder, and its row of the sheet, if it is shown."""
-    rgb, thermal = read_unaligned(dataset, name)
+    rgb, thermal = dataset.unaligned(name)
     if thermal.dtype not in (np.uint8, np.uint16):  # PNG and OpenCV know no other whole numbers
         thermal = thermal.astype(np.float32)
     label = dataset.label(name) if dataset.frame(name).label else None

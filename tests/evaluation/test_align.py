@@ -166,6 +166,17 @@ def test_whole_numbers_that_a_png_cannot_hold(
     assert (after == before).all()
 
 
+def test_link_out_of_the_root_is_not_copied(words: list[str], tmp_path: Path) -> None:
+    link, out = tmp_path / "own/ir/2.png", tmp_path / "out"
+    link.rename(tmp_path / "other.png")
+    link.symlink_to(tmp_path / "other.png")
+    file = tmp_path / "points.csv"
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    with pytest.raises(InputError, match=r"leads out of dataset\.root"):
+        main(Options(out=out, points=file), words)
+    assert not (out / "thermal/2.png").exists()
+
+
 def test_matrix_of_plain_lists(tmp_path: Path) -> None:
     """As Python's json writes it: OpenCV itself writes maps of rows, columns and data."""
     file = tmp_path / "rig.json"
