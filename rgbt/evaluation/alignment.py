@@ -82,8 +82,11 @@ def align(
     worst = [chosen[index] for index in order[:WORST]]
     written = write_aligned(dataset, rig, out, onto=sides[0], labels=sides[1], worst=worst)
     rows = residuals_by_region(shown, rgb.shape[:2], thermal.shape)
-    write_matrix(out, matrix, shown, rows)
-    texts = tuple((name, *map(number, numbers), str(points)) for name, *numbers, points in rows)
+    regions = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+    numbers = {"H": matrix.tolist(), "regions": without_nan(regions)}
+    agree = {"share_of_tiles": shown.share, "outliers": len(shown.outliers)}
+    write_json(out / "alignment.json", numbers | (agree if shown.scores else {}))
+    texts = tuple((name, *map(number, values), str(points)) for name, *values, points in rows)
     header = tuple(name.replace("_px", " (px)").replace("_", " ") for name in COLUMNS)
     note = "root mean square in pixels of thermal; ring 1 is the innermost"
     print_rich(rich_table(TextTable("Alignment", header, texts, (note,))))
@@ -207,11 +210,19 @@ def write_aligned(  # noqa: PLR0913 - what is written, and how
     ):
         raise InputError(f"out={out} holds the input images; choose another folder.")
     labelled, dtypes, seen = set[str](), set[str](), list[float]()
+    sizes = set[tuple[Any, Any]]()  # a rig is of pixels of one size
     rows: dict[str, Pixels] = {}
     with progress() as display:
         task = display.add_task("aligning", total=len(names), note="images")
         for name in names:
-            images, row = _aligned(dataset, rig, name, onto, labels, is_shown=name in worst)
+            rgb, thermal = dataset.unaligned(name)
+            sizes.add((rgb.shape[:2], thermal.shape))
+            if len(sizes) > 1:
+                raise InputError(f"dataset: '{name}' has another size than '{names[0]}'.")
+            if thermal.dtype not in (np.uint8, np.uint16):  # PNG knows no other numbers
+                thermal = thermal.astype(np.float32)
+            pair = {"rgb": rgb, "thermal": thermal}
+            images, row = _aligned(dataset, rig, name, pair, (onto, labels), name in worst)
             seen.append(float((images["valid"] > 0).mean()))
             dtypes.add(kind_of(images["thermal"]))
             if len(dtypes) > 1:
@@ -240,14 +251,17 @@ def _folders(out: Path) -> set[Path]:
 
 
 def _aligned(  # noqa: PLR0913 - one pair
-    dataset: FileDataset, rig: Rig, name: str, onto: Side, labels: Side, *, is_shown: bool
+    dataset: FileDataset,
+    rig: Rig,
+    name: str,
+    pair: dict[str, Pixels],
+    sides: tuple[Side, Side],
+    is_shown: bool,
 ) -> tuple[dict[str, Pixels], Pixels | None]:
     """Return the images of one pair by their folder, and its row of the sheet, if it is shown."""
-    rgb, thermal = dataset.unaligned(name)
-    if thermal.dtype not in (np.uint8, np.uint16):  # PNG and OpenCV know no other whole numbers
-        thermal = thermal.astype(np.float32)
+    onto, labels = sides
     label = dataset.label(name) if dataset.frame(name).label else None
-    hw, other_hw = rgb.shape[:2], thermal.shape
+    hw, other_hw = pair["rgb"].shape[:2], pair["thermal"].shape
     move = rig[0]
     if onto == "thermal":
         hw, other_hw, move = other_hw, hw, rig[1]
@@ -263,7 +277,6 @@ def _aligned(  # noqa: PLR0913 - one pair
             )
         label = label if labels == onto else resampled(label, maps, nearest=True)
         label = np.where(valid, label, IGNORE).astype(np.uint8)
-    pair = {"rgb": rgb, "thermal": thermal}
     other: Side = "thermal" if onto == "rgb" else "rgb"
     unaligned = _shown(dataset, name, other, pair)
     before = cv2.resize(unaligned, hw[::-1], interpolation=cv2.INTER_AREA)
@@ -359,16 +372,3 @@ def _settings(
         "thermal_range": setting,
         "night": dataset.night if isinstance(dataset, Folder) else None,
     }
-
-
-def write_matrix(
-    out: Path, matrix: Floats, found: Alignment, rows: Sequence[tuple[Any, ...]]
-) -> None:
-    """Write alignment.yml, which `matrix` reads, and alignment.json with the numbers."""
-    file = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | 16)
-    file.write("H", matrix)
-    write_atomic(out / "alignment.yml", file.releaseAndGetString().encode())
-    regions = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
-    numbers = {"H": matrix.tolist(), "regions": without_nan(regions)}
-    agree = {"share_of_tiles": found.share, "outliers": len(found.outliers)}
-    write_json(out / "alignment.json", numbers | (agree if found.scores else {}))

@@ -94,9 +94,9 @@ def test_estimated_set_is_a_data_set(
     assert (label == np.where(valid == 255, expected, 255)).all()
     sheet = written(out, "worst.png")
     assert sheet.shape == (8 * 240, 4 * 320, 3)
-    # What alignment.yml holds gives the same images.
+    # What alignment.json holds gives the same images.
     again = tmp_path / "again"
-    assert main(Options(out=again, matrix=out / "alignment.yml"), words) == 0
+    assert main(Options(out=again, matrix=out / "alignment.json"), words) == 0
     assert (written(again, "thermal/3.png") == written(out, "thermal/3.png")).all()
 
 
@@ -164,6 +164,18 @@ def test_whole_numbers_that_a_png_cannot_hold(
     if onto == "rgb":
         after, before = after[:, :155], before[:, 5:]
     assert (after == before).all()
+
+
+def test_images_of_two_sizes_are_refused(words: list[str], tmp_path: Path) -> None:
+    """H is in pixels: it would be wrong for an image of another size."""
+    for kind in ("rgb", "gt"):
+        path = tmp_path / f"own/{kind}/5.png"
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), -1), (80, 60)))
+    file = tmp_path / "points.csv"
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    for options in ({"points": file}, {}):
+        with pytest.raises(InputError, match="has another size than"):
+            main(Options(out=tmp_path / "out", **options), words)
 
 
 def test_link_out_of_the_root_is_not_copied(words: list[str], tmp_path: Path) -> None:
