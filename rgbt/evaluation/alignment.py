@@ -37,7 +37,7 @@ from rgbt.geometry.optical_flow import gray_of
 from rgbt.geometry.rig import CALIBRATION, Rig, maps_of, of_calibration, of_homography, resampled
 from rgbt.metrics.metric import Regions
 from rgbt.tables import TextTable, number, without_nan
-from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
+from rgbt.terminal import path_lines, plain_text, print_rich, rich_table, warn
 from rgbt.types import IGNORE
 
 Side = Literal["rgb", "thermal"]
@@ -93,6 +93,8 @@ def align(
     if found is not None and found.scores:
         say = f"{len(chosen)} pairs, {len(found.outliers)} outliers"
         print_rich(plain_text(f"estimated from {say}; {found.share:.0%} of the tiles agree"))
+    if not isinstance(dataset, Folder):
+        warn(f"{out}/conf has neither absent nor day and night of {dataset.name}: set both there.")
     lines = [("aligned", written), ("pictures", str(out / "worst.png"))]
     print_rich(path_lines([*lines, ("data set", f"RGBT_CONF={out / 'conf'} dataset=aligned")]))
     return 0

@@ -166,6 +166,14 @@ def test_whole_numbers_that_a_png_cannot_hold(
     assert (after == before).all()
 
 
+def test_what_is_not_kept_of_another_data_set(tmp_path: Path, capsys: Any) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("10,10,15,10\n100,10,105,10\n100,90,105,90\n10,90,15,90\n")
+    words = ["dataset=synth", "dataset.num_train=2", "dataset.num_val=1", "dataset.num_test=1"]
+    assert main(Options(out=tmp_path / "out", points=file), words) == 0
+    assert "has neither absent nor day and night of synth" in capsys.readouterr().err
+
+
 def test_images_of_two_sizes_are_refused(words: list[str], tmp_path: Path) -> None:
     """H is in pixels: it would be wrong for an image of another size."""
     for kind in ("rgb", "gt"):
