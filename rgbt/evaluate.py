@@ -79,7 +79,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.predict import chosen
     from rgbt.metrics.details import requested
     from rgbt.requirements import NetworkRecord, record_of
-    from rgbt.terminal import print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
     from rgbt.training.report import announce_network
 
     split, out = options.split, options.out
@@ -110,6 +110,11 @@ def main(options: Options, overrides: list[str]) -> int:
             note = f"{len(made.skipped)} images were unreadable" if made.skipped else ""
         by_view[wanted.view] = next(iter(counts.values()))
         print_rich(tables.overview(opened, counts, note))
+        if wanted.is_own and split == "test":
+            pictures = measure.extreme_pictures(opened, by_view[wanted.view])
+            if not all(path.exists() for path in pictures.values()):
+                measure.draw_extremes(opened, by_view[wanted.view])
+                print_rich(path_lines([("picture", str(path)) for path in pictures.values()]))
     if len(by_view) > 1:
         print_rich(rich_table(tables.views_table(by_view, opened.label)))
     return 0

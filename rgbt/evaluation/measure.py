@@ -30,7 +30,9 @@ from rgbt.metrics.counting import detail_counts, region_counts
 from rgbt.metrics.counts import Counts, read_measurement
 from rgbt.metrics.details import SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.measurement import Measurement, Statistics, settings_of
+from rgbt.metrics.scores import extremes
 from rgbt.processes import collected, num_processes
+from rgbt.tracking.pictures import write_strip
 from rgbt.transforms.maps import nearest
 from rgbt.types import Batch, Sample, View
 
@@ -378,3 +380,24 @@ def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
     day = [name for name, dark in zip(names, at_night, strict=True) if not dark]
     num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
     return tuple(day[:num_day] + night[: NUM_PANELS - num_day])
+
+
+def extreme_pictures(session: Session, counts: Counts) -> dict[str, Path]:
+    """Return the files of the pictures of the best, the median and the worst image, by its name."""
+    found = extremes(counts).items()
+    return {name: session.folder / "figures" / f"{word}.png" for word, (name, _) in found}
+
+
+def draw_extremes(session: Session, counts: Counts, *, writes: bool = True) -> None:
+    """Predict the images of `extreme_pictures` again and write their pictures.
+
+    Every process of a run calls this; one of them `writes`.
+    """
+    paths = extreme_pictures(session, counts)
+    if not paths:
+        return
+    of_these = replace(session, dataset=Subset(session.dataset, tuple(paths)))
+    kept = measure(of_these, counts.measurement, keep=tuple(paths)).kept
+    for sample, classes in kept if writes else ():
+        paths[sample.name].parent.mkdir(exist_ok=True)
+        write_strip(sample, classes, session.dataset, paths[sample.name])
