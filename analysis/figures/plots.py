@@ -154,21 +154,23 @@ def dot_plot(axes: Axes, frame: pd.DataFrame, *, open_low: bool = False) -> None
     axes.grid(visible=False, axis="x")
 
 
-def bar_plot(axes: Axes, frame: pd.DataFrame) -> None:
+def bar_plot(axes: Axes, frame: pd.DataFrame, colours: Sequence[str] = ()) -> None:
     """Draw horizontal bars of (series, tick, value), those of a tick together, from the top.
 
-    Up to three series have their values written beside the bars.
+    Up to three series have their values written beside the bars. `colours`: all series of a page,
+    of which each has the same colour everywhere.
     """
     ticks, series = [*dict.fromkeys(frame["tick"])], [*dict.fromkeys(frame["series"])]
     thick = 0.8 / len(series)
     for index, name in enumerate(series):
         rows = frame[frame["series"] == name]
         at = rows["tick"].map(ticks.index) + (index - (len(series) - 1) / 2) * thick
-        hatch = HATCHES[index // len(COLOURS) % len(HATCHES)]
-        how: Any = {"color": series_style(index)["color"], "hatch": hatch, "edgecolor": "white"}
+        place = colours.index(name) if colours else index
+        hatch = HATCHES[place // len(COLOURS) % len(HATCHES)]
+        how: Any = {"color": series_style(place)["color"], "hatch": hatch, "edgecolor": "white"}
         bars = axes.barh(at, rows["value"], thick, label=name, linewidth=0, **how)
         if len(series) <= 3:
-            axes.bar_label(bars, rows["value"].map("{:.1f}".format), padding=2, fontsize=TINY + 1)
+            axes.bar_label(bars, rows["value"].map("{:.1f}".format), padding=2, fontsize=SMALL)
     axes.set_yticks(range(len(ticks)), [folded(readable(tick), 1.1) for tick in ticks])
     axes.set_ylim(len(ticks) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")

@@ -328,16 +328,18 @@ def corruption_means(corrupted_: pd.DataFrame) -> pd.DataFrame:
 
 
 @plots.styled
-def draw_bars(frame: pd.DataFrame, what: str) -> Figure:
-    """Draw horizontal bars (`plots.bar_plot`) of `what`, with a legend below."""
+def draw_bars(frame: pd.DataFrame, what: str, colours: Sequence[str] = ()) -> Figure:
+    """Draw horizontal bars of `what` (`plots.bar_plot`), with a legend below."""
     many, ticks = frame["series"].nunique(), frame["tick"].nunique()
-    made = plots.new_figure(plots.COLUMN, 0.6 + ticks * max(0.2, 0.09 * many) + plots.LINE * many)
+    # Up to three bars have numbers beside them.
+    tall = max(0.2, many * (0.13 if many <= 3 else 0.07))
+    made = plots.new_figure(plots.COLUMN, 0.7 + ticks * tall)
     axes = made.subplots()
-    plots.bar_plot(axes, frame)
+    plots.bar_plot(axes, frame, colours)
     axes.set_xlabel(what)
     if not frame["value"].isna().all():
         axes.set_xlim(0, min(106.0, 1.12 * max(5.0, float(frame["value"].max()))))
-    plots.series_legend(made, axes, columns=1)
+    plots.series_legend(made, axes, columns=3)
     return made
 
 
@@ -377,7 +379,7 @@ def curve_points(lines: Mapping[str, Sequence[MetricLine]]) -> pd.DataFrame:
 def draw_curves(frame: pd.DataFrame) -> Figure:
     """Draw a panel for the loss and one for the validation below it, with a line for each run."""
     series, kinds = [*dict.fromkeys(frame["series"])], [*dict.fromkeys(frame["kind"])]
-    made = plots.new_figure(plots.COLUMN, 0.3 + 1.35 * len(kinds) + plots.LINE * len(series))
+    made = plots.new_figure(plots.COLUMN, 0.3 + 1.35 * len(kinds))
     panels = made.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
     styles = {name: plots.series_style(index) for index, name in enumerate(series)}
     for axes, kind in zip(panels, kinds, strict=True):
@@ -385,10 +387,11 @@ def draw_curves(frame: pd.DataFrame) -> Figure:
         how = {name: {**style, "marker": marker} for name, style in styles.items()}
         plots.line_plot(axes, frame[frame["kind"] == kind], how)
         axes.set_ylabel(kind)
-        axes.set_ylim(bottom=0)
+        if (frame[frame["kind"] == kind]["value"] >= 0).all():
+            axes.set_ylim(bottom=0)
     panels[-1].set_xlabel("step")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    plots.series_legend(made, fullest, columns=1)
+    plots.series_legend(made, fullest, columns=3)
     return made
 
 

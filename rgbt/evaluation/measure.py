@@ -32,6 +32,7 @@ from rgbt.metrics.details import SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.measurement import Measurement, Statistics, settings_of
 from rgbt.metrics.scores import extremes
 from rgbt.processes import collected, num_processes
+from rgbt.terminal import info
 from rgbt.tracking.pictures import write_strip
 from rgbt.transforms.maps import nearest
 from rgbt.types import Batch, Sample, View
@@ -401,3 +402,12 @@ def draw_extremes(session: Session, counts: Counts, *, writes: bool = True) -> N
     for sample, classes in kept if writes else ():
         paths[sample.name].parent.mkdir(exist_ok=True)
         write_strip(sample, classes, session.dataset, paths[sample.name])
+
+
+def draw_missing(session: Session, counts: Counts) -> None:
+    """Draw the pictures that the folder of a run lacks, where `counts` are those of its own test."""
+    wanted = counts.measurement
+    paths = extreme_pictures(session, counts)
+    if wanted.is_own and wanted.split == "test" and not all(map(Path.exists, paths.values())):
+        draw_extremes(session, counts)
+        info(f"{', '.join(path.name for path in paths.values())} are in {session.folder}/figures.")

@@ -36,8 +36,9 @@ def html_page(own: Mapping[str, Any], rest: str, not_run: str, images: Mapping[s
 
 def _rendered(text: str, images: Mapping[str, bytes]) -> str:
     """Markdown as HTML, with headings one level lower than written and figures inside."""
-    from analysis.figures.page import inline
     from markdown_it import MarkdownIt
+
+    from analysis.figures.page import inline
 
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")
     body = ""
