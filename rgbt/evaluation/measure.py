@@ -405,7 +405,7 @@ def draw_extremes(session: Session, counts: Counts, *, writes: bool = True) -> N
 
 
 def draw_missing(session: Session, counts: Counts) -> None:
-    """Draw the pictures that the folder of a run lacks, where `counts` are those of its own test."""
+    """Draw the pictures that the folder of a run lacks, if `counts` are those of its own test."""
     wanted = counts.measurement
     paths = extreme_pictures(session, counts)
     if wanted.is_own and wanted.split == "test" and not all(map(Path.exists, paths.values())):

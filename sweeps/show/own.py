@@ -19,7 +19,7 @@ from rgbt.runs.result import RunResult
 from rgbt.tables import number
 from sweeps.run.progress import duration
 from sweeps.score.reader import EXPERIMENT, SEED, RunReader
-from sweeps.show.sections import ODD, number_of, short_names
+from sweeps.show.sections import ODD, number_of, public, short_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +85,7 @@ def _facts(run: RunResult, reader: RunReader, remarks: list[str]) -> Facts:
     return {
         "run": run,
         "key": run.key,
-        "group": one_line(run.tags.get(GROUP, run.key)),
+        "group": public(one_line(run.tags.get(GROUP, run.key))),
         "seed": run.tags[SEED],
         "counts": counts,
         "lines": lines,
@@ -129,7 +129,7 @@ def _pictured(run: Facts, place: str) -> Facts:
         try:
             of_image, legend, pictures = stored_pictures(path)
         except InputError as error:
-            missing.append(one_line(error).replace(str(path), path.name))
+            missing.append(public(one_line(error)))
             continue
         if of_image == name:
             images.append(
@@ -217,4 +217,4 @@ def _unfinished(runs_dir: Path) -> Iterator[str]:
         except (*ODD, OSError) as error:
             state = one_line(error)
         now = "is being trained" if folder.is_locked() else "is not finished"
-        yield f"{folder.path.name} {now}: {state}."
+        yield public(f"{folder.path.name} {now}: {state}.")

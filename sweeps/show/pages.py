@@ -15,7 +15,6 @@ from analysis.results import finished_runs
 from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
-from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
 from sweeps.judge.agreement import contrasts_frame, pairs_of, ranks_of, signs_of
 from sweeps.judge.judged_claim import NOT_RUN
@@ -42,6 +41,7 @@ from sweeps.show.sections import (
     networks_section,
     number_of,
     paper_section,
+    public,
     runs_section,
 )
 
@@ -50,9 +50,6 @@ if TYPE_CHECKING:
 
 # Scales in the order in which their verdicts count more.
 SCALES = ("smoke", "demo", "bench", "real", "paper")
-
-# A path from the root of a machine; addresses of pages and relative paths do not match.
-ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 
 # Beginning of markup that is not ours, such as an element in a text of a run.
 MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
@@ -189,7 +186,7 @@ class Report:
         template = environment.get_template("pages.md.j2")
         text = template.render(data=data, page=name, paper=papers.get(name))
         text = re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
-        return MARKUP.sub("&lt;", ABSOLUTE.sub(r".../\1", without_passwords(text)))
+        return MARKUP.sub("&lt;", public(text))
 
     def pages(self) -> dict[str, str]:
         """Return every page of ``docs/results`` by its file; those of a user's tables too."""

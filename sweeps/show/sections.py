@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ from rgbt.config.compose import DEFAULT_SCALE
 from rgbt.metrics import names
 from rgbt.metrics.named import value
 from rgbt.runs.folder import GROUP
-from rgbt.runs.provenance import commit_of
+from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.agreement import signs_of
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 STUDIES = "studies"
 METRICS = (names.MIOU, names.VAR)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
+# A path from the root of a machine; addresses of pages and relative paths do not match.
+ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 # Errors that a record may raise that somebody has edited.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 
@@ -246,6 +249,11 @@ def short_names(methods: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     for method, of_method in words.items():
         named[method] = " ".join(word for word in of_method if word not in shared)
     return named, shared
+
+
+def public(text: str) -> str:
+    """Return a text without passwords, and with the last part alone of absolute paths."""
+    return ABSOLUTE.sub(r".../\1", without_passwords(text))
 
 
 def number_of(count: int, noun: str) -> str:

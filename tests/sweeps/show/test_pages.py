@@ -92,8 +92,10 @@ def report(place: Path) -> Report:
 
 
 @pytest.fixture(scope="module")
-def html(report: Report) -> str:
-    return report.html()
+def html(report: Report, place: Path) -> str:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        return report.html()
 
 
 def section(text: str, heading: str) -> str:
