@@ -40,6 +40,7 @@ def _rendered(text: str, images: Mapping[str, bytes]) -> str:
 
     from analysis.figures.page import inline
 
+    text = re.sub(r"<!--.*?-->\n", "", text)
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")
     body = ""
     for place, part in enumerate(FOLDED.split(text)):  # every second part is a tag

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from analysis.figures.page import stored_pictures
 from rgbt import evaluate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import extremes

@@ -202,6 +202,7 @@ def test_html_puts_own_results_first_and_folds_the_rest(html: str) -> None:
     assert folded[-1] == "Tables and claims without a run"
     assert "What the words mean" in folded
     assert "planted (scale=demo)" not in folded
+    assert "needs: " not in html, "a comment for the tests of the pages"
     assert html.count("<details") == html.count("</details>")
 
 
