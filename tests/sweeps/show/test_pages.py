@@ -197,7 +197,7 @@ def test_html_puts_own_results_first_and_folds_the_rest(html: str) -> None:
     parts = ("mIoU by region", "Runs</h2>", "planted (scale=demo)", "Claims</h2>")
     parts = (*parts, "No run yet: ", "TABLE IV: ", "Temporal: claims without a verdict")
     assert sorted(parts, key=html.index) == [*parts]
-    assert re.search(r"No run yet: 1[0-9]+ claims and [0-9]+ tables", html)
+    assert re.search(r"No run yet: [0-9]+ claims and [0-9]+ tables", html)
     folded = re.findall(r"<details><summary>([^<]*)</summary>", html)
     assert folded[-1] == "Tables and claims without a run"
     assert "What the words mean" in folded
