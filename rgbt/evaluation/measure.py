@@ -146,6 +146,7 @@ def measure(
     wanted: Measurement,
     details: Sequence[Details] = (),
     keep: Sequence[str] = (),
+    only: Sequence[str] = (),
 ) -> Measured:
     """Predict a split with the network of `session`, and count, with a progress bar.
 
@@ -157,6 +158,7 @@ def measure(
         wanted: the measurement.
         details: what else to count.
         keep: names of the images that are returned for pictures.
+        only: names of the images that are predicted; (): all of the split.
 
     Raises:
         InputError: a file cannot be read, or a measurement that does not fit the network or data.
@@ -174,7 +176,9 @@ def measure(
     kept: list[Kept] = []
     skipped: list[str] = []
     needs_confidence = any(detail.kind == "calibration" for detail in details)
-    predicted = _predicted(session, predictor, wanted, skipped, needs_confidence=needs_confidence)
+    predicted = _predicted(
+        session, predictor, wanted, skipped, only, needs_confidence=needs_confidence
+    )
     with memory, closing(predicted):
         for name, label, classes, confidence in predicted:
             counted[name] = {"": region_counts(label, classes, num_classes, regions)}
@@ -205,6 +209,7 @@ def _predicted(
     predictor: Predictor,
     wanted: Measurement,
     skipped: list[str],
+    only: Sequence[str],
     *,
     needs_confidence: bool,
 ) -> Generator[tuple[str, Tensor, Tensor, Tensor | None], None, None]:
@@ -220,7 +225,8 @@ def _predicted(
         classes, confidence = predictor.confident_classes(batch)
         return classes.cpu(), list(confidence.cpu())
 
-    for names, sources in parts_of_split(session.dataset, wanted):
+    for part, sources in parts_of_split(session.dataset, wanted):
+        names = tuple(name for name in part if name in only) if only else part
         with normalised(session, predictor, wanted, sources) as unmeasured:
             batches = eval_batches(session.dataset, names, session.transform, session.loading)
             for loaded in shown(batches, wanted.split, len(names)):
@@ -397,8 +403,7 @@ def draw_extremes(session: Session, counts: Counts, *, writes: bool = True) -> N
     paths = extreme_pictures(session, counts)
     if not paths:
         return
-    of_these = replace(session, dataset=Subset(session.dataset, tuple(paths)))
-    kept = measure(of_these, counts.measurement, keep=tuple(paths)).kept
+    kept = measure(session, counts.measurement, keep=tuple(paths), only=tuple(paths)).kept
     for sample, classes in kept if writes else ():
         paths[sample.name].parent.mkdir(exist_ok=True)
         write_strip(sample, classes, session.dataset, paths[sample.name])
