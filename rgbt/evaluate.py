@@ -5,9 +5,10 @@ The command writes the counts and prints the tables derived from them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import (
@@ -23,6 +24,12 @@ from rgbt.config.common_options import (
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.details import WIDTH
+
+if TYPE_CHECKING:
+    from rgbt.assembly.session import Session
+    from rgbt.metrics.counts import Counts
+    from rgbt.metrics.details import Details
+    from rgbt.metrics.measurement import Measurement
 
 # Value of `modality`: each view of the network.
 ALL = "all"
@@ -102,17 +109,28 @@ def main(options: Options, overrides: list[str]) -> int:
         if view == views[0]:
             measure.predictor_of(opened, wanted)  # refuses what cannot be measured
             announce_network(opened)
-        files = measure.files_of(opened, wanted, details, out)
-        counts, note = measure.stored(opened, files), "measured before"
-        if len(counts) < len(files):
-            made = measure.measure(opened, wanted, details)
-            counts = measure.store(files, made, counts)
-            note = f"{len(made.skipped)} images were unreadable" if made.skipped else ""
+        counts, note = _counted(opened, wanted, details, out)
         by_view[wanted.view] = next(iter(counts.values()))
         print_rich(tables.overview(opened, counts, note))
+        measure.draw_missing(opened, by_view[wanted.view])
     if len(by_view) > 1:
         print_rich(rich_table(tables.views_table(by_view, opened.label)))
     return 0
+
+
+def _counted(
+    session: Session, wanted: Measurement, details: Sequence[Details], out: Path | None
+) -> tuple[dict[Path, Counts], str]:
+    """The counts by their files, which are measured where they are missing, and a note on them."""
+    from rgbt.evaluation import measure
+
+    files = measure.files_of(session, wanted, details, out)
+    counts = measure.stored(session, files)
+    if len(counts) == len(files):
+        return counts, "measured before"
+    made = measure.measure(session, wanted, details)
+    note = f"{len(made.skipped)} images were unreadable" if made.skipped else ""
+    return measure.store(files, made, counts), note
 
 
 entry = PlainCommand(Options, main)

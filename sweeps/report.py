@@ -38,7 +38,7 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Write what finished runs show: tables beside the papers, verdicts of claims, runs.
+    """Write what finished runs show: images, charts, tables beside the papers, verdicts of claims.
 
     Runs come from a folder of runs and an archive together. Every score is computed from the counts
     of its run. What cannot be read is reported here and listed on the page. No MLflow store and no
@@ -51,6 +51,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import info, path_lines, print_rich
     from sweeps.show.pages import Report
+    from sweeps.show.sections import number_of
 
     gc.set_threshold(1_000_000, 20, 20)  # a tenth of the time, for 40 MB: many small objects stay
     report = Report(options.runs_dir, options.archive, options.resamples, counted=is_markdown)
@@ -75,7 +76,8 @@ def main(options: Options, overrides: list[str]) -> int:
     runs = len(list(report.reader))
     tables = sum(table.is_run for table in report.tables)
     lines = [("page", str(path)) for path in files]
-    print_rich(path_lines([*lines, ("holds", f"{runs} runs, {tables} tables with runs")]))
+    held = f"{number_of(runs, 'run')}, {number_of(tables, 'table')} with runs"
+    print_rich(path_lines([*lines, ("holds", held)]))
     return 0
 
 

@@ -53,6 +53,7 @@ def without_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("draw_panel", "draw_region_heat"):
             patch.setattr(training, name, draw)
+        patch.setattr(training, "draw_extremes", lambda *_, **__: [])
         for module in (pair_pictures, files):
             patch.setattr(module, "draw_pairs", draw)
         yield

@@ -145,7 +145,7 @@ def test_finished_run_shows_its_tables_again(call: Call, data: Path, tmp_path: P
     words = (data, tmp_path, "+experiment=grbm", *short(1))
     code, out, err = train(call, *words)
     assert code == 0, err
-    for picture in ("panel.png", "regions.png"):
+    for picture in ("panel.png", "regions.png", "best.png", "worst.png"):
         assert (only_run(tmp_path) / "figures" / picture).stat().st_size > 1000
     # The default, typed: the same run.
     code, again, err = train(call, *words, "masker.sigma_div=4")

@@ -197,7 +197,7 @@ class RunOptions:
     def counts(self, frames: Frames = "") -> dict[str, list[Counts]]:
         """Open the counts of the seeds of each method, by its label."""
         found: dict[str, list[Counts]] = {}
-        for label, word in self._entries():
+        for label, word in self.entries():
             for opened in open_counts(word, self.runs_dir, self.split, frames):
                 found.setdefault(label or opened.label, []).append(opened.counts)
         return found
@@ -205,12 +205,12 @@ class RunOptions:
     def trainings(self) -> dict[str, list[Levels]]:
         """Open what rgbt robustness measured of the seeds of each method, by its label."""
         found: dict[str, list[Levels]] = {}
-        for label, word in self._entries():
+        for label, word in self.entries():
             for own_label, levels in trainings(word, self.runs_dir, self.split):
                 found.setdefault(label or own_label, []).append(levels)
         return found
 
-    def _entries(self) -> Iterator[tuple[str, str]]:
+    def entries(self) -> Iterator[tuple[str, str]]:
         """Yield the label ("": its own) and the name of each entry."""
         for word in split_list(self.runs, "runs"):
             label, colon, place = word.partition(":")

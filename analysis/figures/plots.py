@@ -52,6 +52,7 @@ SUFFIXES = (".pdf", ".svg", ".png")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777", "#999933")
 
 APART = "black"
+HATCHES = ("", "////", "....", "xxxx")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
 LINES = ("-", "--", "-.", ":")
 
@@ -77,16 +78,21 @@ def out_path(out: str) -> Path:
     return path
 
 
-@styled
 def save(figure: Figure, path: Path) -> None:
     """Write `figure` at its size: PDF and SVG with text as text, PNG at 300 dots per inch."""
-    kind = out_path(str(path)).suffix.lower()[1:]
+    content = content_of(figure, out_path(str(path)).suffix.lower()[1:])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, content)
+
+
+@styled
+def content_of(figure: Figure, kind: str) -> bytes:
+    """Return the bytes of a file of `figure`: "pdf", "svg" or "png"."""
     # Without the time of day the same data gives the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {}}[kind]
     content = io.BytesIO()
     figure.savefig(content, format=kind, metadata=dated)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, content.getvalue())
+    return content.getvalue()
 
 
 def series_style(index: int) -> dict[str, Any]:
@@ -146,6 +152,28 @@ def dot_plot(axes: Axes, frame: pd.DataFrame, *, open_low: bool = False) -> None
     axes.set_xticks(range(len(ticks)), [readable(tick).replace(" (", "\n(") for tick in ticks])
     axes.set_xlim(-0.5, len(ticks) - 0.5)
     axes.grid(visible=False, axis="x")
+
+
+def bar_plot(axes: Axes, frame: pd.DataFrame, colours: Sequence[str] = ()) -> None:
+    """Draw horizontal bars of (series, tick, value), those of a tick together, from the top.
+
+    Up to three series have their values written beside the bars. `colours`: all series of a page,
+    of which each has the same colour everywhere.
+    """
+    ticks, series = [*dict.fromkeys(frame["tick"])], [*dict.fromkeys(frame["series"])]
+    thick = 0.8 / len(series)
+    for index, name in enumerate(series):
+        rows = frame[frame["series"] == name]
+        at = rows["tick"].map(ticks.index) + (index - (len(series) - 1) / 2) * thick
+        place = colours.index(name) if colours else index
+        hatch = HATCHES[place // len(COLOURS) % len(HATCHES)]
+        how: Any = {"color": series_style(place)["color"], "hatch": hatch, "edgecolor": "white"}
+        bars = axes.barh(at, rows["value"], thick, label=name, linewidth=0, **how)
+        if len(series) <= 3:
+            axes.bar_label(bars, rows["value"].map("{:.1f}".format), padding=2, fontsize=SMALL)
+    axes.set_yticks(range(len(ticks)), [folded(readable(tick), 1.1) for tick in ticks])
+    axes.set_ylim(len(ticks) - 0.5, -0.5)
+    axes.grid(visible=False, axis="y")
 
 
 def heat(

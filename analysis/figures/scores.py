@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from analysis.commands import DrawOptions
 from analysis.figures import plots
 from analysis.figures.inputs import Drawn, RunOptions, check_same_images, figure
-from analysis.results import Evaluation, Levels, row_of
+from analysis.results import Evaluation, Levels, open_counts, row_of
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.corruption_node import row_name
@@ -29,6 +29,7 @@ from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
 from rgbt.metrics.scores import class_mean, miou, tally
+from rgbt.runs.folder import MetricLine, RunFolder
 from rgbt.tables import class_labels
 from rgbt.tracking.pictures import colour_limits
 
@@ -46,6 +47,9 @@ MISSING = "one image missing"
 
 # Regions over which bars of several methods stand side by side.
 SPREAD = 0.3
+
+# Panels of learning curves.
+LOSS, VAL = "training loss", "validation mIoU (%)"
 
 # Size of a heat map of regions in pixels.
 MAP_HW = (480, 640)
@@ -292,6 +296,103 @@ def region_means(
             rows.append((label, reference.partition, region, mean, *bounds, *about))
     columns = ["series", "partition", "x", "value", "low", "high"]
     return pd.DataFrame(rows, columns=[*columns, "mIoU", "seeds", "images", "covers"])
+
+
+@figure("classes", "IoU by class, one bar per method")
+def by_class(given: RunOptions) -> Drawn:
+    """Draw IoU by class, means over seeds."""
+    frame = class_means(given.counts(), given.absent)
+    return draw_bars(frame, "IoU (%)"), frame
+
+
+def class_means(methods: Mapping[str, Sequence[Counts]], absent: Absent | None) -> pd.DataFrame:
+    """Compute IoU (value, percent) by class (tick) of methods (series), means over seeds.
+
+    InputError: counts that do not belong together.
+    """
+    every = [counts for seeds in methods.values() for counts in seeds]
+    reference, convened, rows = check_same_images(every), absent or convention(every), []
+    labels = class_labels(reference.classes, reference.unscored)
+    for name, label in zip(reference.classes, labels, strict=True):
+        metric = names.class_iou(name)
+        for method, seeds in methods.items():
+            of_seeds = [value(metric, counts, convened) for counts in seeds]
+            rows.append((method, label, float(np.mean(of_seeds)), len(seeds)))
+    return pd.DataFrame(rows, columns=["series", "tick", "value", "seeds"])
+
+
+def corruption_means(corrupted_: pd.DataFrame) -> pd.DataFrame:
+    """Average the mIoU (value) of `corrupted` over severities: a tick per corruption."""
+    shown = corrupted_.rename(columns={"method": "series", "title": "tick", "mIoU": "value"})
+    return shown.groupby(["tick", "series"], sort=False, as_index=False)["value"].mean()
+
+
+@plots.styled
+def draw_bars(frame: pd.DataFrame, what: str, colours: Sequence[str] = ()) -> Figure:
+    """Draw horizontal bars of `what` (`plots.bar_plot`), with a legend below."""
+    many, ticks = frame["series"].nunique(), frame["tick"].nunique()
+    # Up to three bars have numbers beside them.
+    tall = max(0.2, many * (0.13 if many <= 3 else 0.07))
+    made = plots.new_figure(plots.COLUMN, 0.7 + ticks * tall)
+    axes = made.subplots()
+    plots.bar_plot(axes, frame, colours)
+    axes.set_xlabel(what)
+    if not frame["value"].isna().all():
+        axes.set_xlim(0, min(106.0, 1.12 * max(5.0, float(frame["value"].max()))))
+    plots.series_legend(made, axes, columns=3)
+    return made
+
+
+@figure("curves", "training loss and validation mIoU over the steps, one line per run")
+def curves(given: RunOptions) -> Drawn:
+    """Draw what metrics.jsonl of runs holds; seeds of one method are lines of their own."""
+    lines = {}
+    for label, word in given.entries():
+        for opened in open_counts(word, given.runs_dir, given.split):
+            if opened.run is not None:
+                name = label or opened.label
+                name = name if name not in lines else f"{name} seed={opened.seed}"
+                lines[name] = RunFolder(opened.run.folder, writes=False).lines()
+    frame = curve_points(lines)
+    return draw_curves(frame), frame
+
+
+def curve_points(lines: Mapping[str, Sequence[MetricLine]]) -> pd.DataFrame:
+    """Return loss and validation mIoU in percent (value; kind) over steps (x) of runs (series).
+
+    InputError: there is nothing to draw.
+    """
+    rows = []
+    for name, of_run in lines.items():
+        for line in of_run:
+            if line.kind == "train" and "loss" in line.values:
+                rows.append((LOSS, name, line.step, line.values["loss"]))
+            elif line.kind == "val" and names.MIOU in line.values:
+                rows.append((VAL, name, line.step, 100 * line.values[names.MIOU]))
+    if not rows:
+        raise InputError("runs: their metrics.jsonl have no loss and no validation.")
+    found = pd.DataFrame(rows, columns=["kind", "series", "x", "value"])
+    return found.assign(low=math.nan, high=math.nan)
+
+
+@plots.styled
+def draw_curves(frame: pd.DataFrame) -> Figure:
+    """Draw a panel for the loss and one for the validation below it, with a line for each run."""
+    series, kinds = [*dict.fromkeys(frame["series"])], [*dict.fromkeys(frame["kind"])]
+    made = plots.new_figure(plots.COLUMN, 0.3 + 1.35 * len(kinds))
+    panels = made.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
+    styles = {name: plots.series_style(index) for index, name in enumerate(series)}
+    for axes, kind in zip(panels, kinds, strict=True):
+        marker = "." if kind == VAL else ""
+        how = {name: {**style, "marker": marker} for name, style in styles.items()}
+        plots.line_plot(axes, frame[frame["kind"] == kind], how)
+        axes.set_ylabel(kind)
+        if (frame[frame["kind"] == kind]["value"] >= 0).all():
+            axes.set_ylim(bottom=0)
+    panels[-1].set_xlabel("step")
+    fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
+    plots.series_legend(made, fullest, columns=3)
+    return made
 
 
 @plots.styled

@@ -30,7 +30,10 @@ from rgbt.metrics.counting import detail_counts, region_counts
 from rgbt.metrics.counts import Counts, read_measurement
 from rgbt.metrics.details import SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.measurement import Measurement, Statistics, settings_of
+from rgbt.metrics.scores import extremes
 from rgbt.processes import collected, num_processes
+from rgbt.terminal import info
+from rgbt.tracking.pictures import write_strip
 from rgbt.transforms.maps import nearest
 from rgbt.types import Batch, Sample, View
 
@@ -143,6 +146,7 @@ def measure(
     wanted: Measurement,
     details: Sequence[Details] = (),
     keep: Sequence[str] = (),
+    only: Sequence[str] = (),
 ) -> Measured:
     """Predict a split with the network of `session`, and count, with a progress bar.
 
@@ -154,6 +158,7 @@ def measure(
         wanted: the measurement.
         details: what else to count.
         keep: names of the images that are returned for pictures.
+        only: names of the images that are predicted; (): all of the split.
 
     Raises:
         InputError: a file cannot be read, or a measurement that does not fit the network or data.
@@ -171,7 +176,9 @@ def measure(
     kept: list[Kept] = []
     skipped: list[str] = []
     needs_confidence = any(detail.kind == "calibration" for detail in details)
-    predicted = _predicted(session, predictor, wanted, skipped, needs_confidence=needs_confidence)
+    predicted = _predicted(
+        session, predictor, wanted, skipped, only, needs_confidence=needs_confidence
+    )
     with memory, closing(predicted):
         for name, label, classes, confidence in predicted:
             counted[name] = {"": region_counts(label, classes, num_classes, regions)}
@@ -202,6 +209,7 @@ def _predicted(
     predictor: Predictor,
     wanted: Measurement,
     skipped: list[str],
+    only: Sequence[str],
     *,
     needs_confidence: bool,
 ) -> Generator[tuple[str, Tensor, Tensor, Tensor | None], None, None]:
@@ -217,7 +225,8 @@ def _predicted(
         classes, confidence = predictor.confident_classes(batch)
         return classes.cpu(), list(confidence.cpu())
 
-    for names, sources in parts_of_split(session.dataset, wanted):
+    for part, sources in parts_of_split(session.dataset, wanted):
+        names = tuple(name for name in part if name in only) if only else part
         with normalised(session, predictor, wanted, sources) as unmeasured:
             batches = eval_batches(session.dataset, names, session.transform, session.loading)
             for loaded in shown(batches, wanted.split, len(names)):
@@ -378,3 +387,32 @@ def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
     day = [name for name, dark in zip(names, at_night, strict=True) if not dark]
     num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
     return tuple(day[:num_day] + night[: NUM_PANELS - num_day])
+
+
+def extreme_pictures(session: Session, counts: Counts) -> dict[str, Path]:
+    """Return the files of the pictures of the best, the median and the worst image, by its name."""
+    found = extremes(counts).items()
+    return {name: session.folder / "figures" / f"{word}.png" for word, (name, _) in found}
+
+
+def draw_extremes(session: Session, counts: Counts, *, writes: bool = True) -> None:
+    """Predict the images of `extreme_pictures` again and write their pictures.
+
+    Every process of a run calls this; one of them `writes`.
+    """
+    paths = extreme_pictures(session, counts)
+    if not paths:
+        return
+    kept = measure(session, counts.measurement, keep=tuple(paths), only=tuple(paths)).kept
+    for sample, classes in kept if writes else ():
+        paths[sample.name].parent.mkdir(exist_ok=True)
+        write_strip(sample, classes, session.dataset, paths[sample.name])
+
+
+def draw_missing(session: Session, counts: Counts) -> None:
+    """Draw the pictures that the folder of a run lacks, if `counts` are those of its own test."""
+    wanted = counts.measurement
+    paths = extreme_pictures(session, counts)
+    if wanted.is_own and wanted.split == "test" and not all(map(Path.exists, paths.values())):
+        draw_extremes(session, counts)
+        info(f"{', '.join(path.name for path in paths.values())} are in {session.folder}/figures.")

@@ -162,6 +162,25 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     return result
 
 
+def extremes(counts: Counts) -> dict[str, tuple[str, float]]:
+    """Name the "best", "median" and "worst" image, each with its mIoU in percent.
+
+    It is over the scored classes that its label or prediction hold, because a single image lacks
+    most classes. Of an even number of images the median is the upper one of the two in the middle;
+    of fewer than three images there are fewer entries.
+    """
+    scores = 100 * miou(tally(counts.counts.sum(1)), "exclude", counts.scored)
+    ranked = np.argsort(scores, kind="stable")[: np.count_nonzero(~np.isnan(scores))]
+    if not len(ranked):
+        return {}
+    words = {0: "worst", len(ranked) // 2: "median", len(ranked) - 1: "best"}
+    found = {}
+    for place in sorted(words, reverse=True):
+        image = ranked[place]
+        found[words[place]] = counts.names[image], float(scores[image])
+    return found
+
+
 def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
     by_region = tally(counts.by_region())
     return {

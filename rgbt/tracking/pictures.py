@@ -5,6 +5,7 @@ Matplotlib is imported when something is drawn and never opens a window.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,9 @@ IGNORED_COLOUR = (128, 128, 128)
 
 # Width of a letter of eight points, on average.
 LETTER_INCHES = 0.07
+
+# Pictures of an example, from left to right.
+COLUMNS = ("RGB", "thermal", "ground truth", "prediction")
 
 # Percent points from the mean region to either end of the heat map's colours, at least.
 HALF_SPAN = 15.0
@@ -68,13 +72,35 @@ def draw_panel(
 
     An example is a sample and its predicted classes, at the size of its label.
     """
-    palette, rows = palette_of(dataset), []
-    for sample, prediction in examples:
-        label = np.full_like(prediction, IGNORE) if sample.label is None else sample.label
-        thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
-        painted = colours(label, palette), colours(prediction, palette)
-        rows.append((sample.name, (sample.rgb, thermal, *painted)))
-    draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), dataset, path)
+    rows = [(sample.name, _row(sample, classes, dataset)) for sample, classes in examples]
+    draw_columns(rows, COLUMNS, dataset, path)
+
+
+def _row(sample: Sample, prediction: Image, dataset: LabelledDataset) -> list[Image]:
+    """The pictures (H, W, 3) of `COLUMNS`."""
+    palette = palette_of(dataset)
+    label = np.full_like(prediction, IGNORE) if sample.label is None else sample.label
+    thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
+    return [sample.rgb, thermal, colours(label, palette), colours(prediction, palette)]
+
+
+def write_strip(sample: Sample, prediction: Image, dataset: LabelledDataset, path: Path) -> None:
+    """Write the pictures of `COLUMNS` side by side, (H, 4 W, 3), as a PNG without letters.
+
+    Its text chunk "image" is the name of the image, "classes" JSON: a list of [name, red, green,
+    blue], because not every configuration has the palette.
+    """
+    from PIL import Image as Pillow
+    from PIL.PngImagePlugin import PngInfo
+
+    named = zip(dataset.classes, dataset.palette, strict=True)
+    legend = [(name, *map(int, colour)) for name, colour in named]
+    texts = PngInfo()
+    texts.add_itxt("image", sample.name)
+    texts.add_itxt("classes", json.dumps(legend))
+    strip = np.concatenate(_row(sample, prediction, dataset), axis=1)
+    with replacing(path) as file:
+        Pillow.fromarray(strip).save(file, format="png", pnginfo=texts)
 
 
 def draw_columns(

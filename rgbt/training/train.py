@@ -25,6 +25,7 @@ from rgbt.engine.memory import naming_memory, training_advice
 from rgbt.engine.trainer import Hooks, StepData, Trainer, Values
 from rgbt.evaluation.measure import (
     Measured,
+    draw_extremes,
     measure,
     measurement_of,
     panel_names,
@@ -289,6 +290,7 @@ class Training(Hooks):
         beside |= values_of_it
         state.skip(result.skipped)
         self._save([*counts, *of_other_head])
+        draw_extremes(session, result.counts, writes=self.folder.writes)
         values = scores.summary(result.counts, session.regions.absent) | beside
         table = None
         if "test" in pairs:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import re
-import tempfile
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +15,6 @@ from analysis.results import finished_runs
 from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from rgbt.files.yaml_files import read_yaml
-from rgbt.runs.provenance import without_passwords
 from rgbt.tables import number
 from sweeps.judge.agreement import contrasts_frame, pairs_of, ranks_of, signs_of
 from sweeps.judge.judged_claim import NOT_RUN
@@ -35,33 +31,31 @@ from sweeps.show.agreement import (
     signs_in_words,
 )
 from sweeps.show.claims import chance_of, counts_grid, statement
+from sweeps.show.html import TEMPLATES, html_page
+from sweeps.show.own import own_section
 from sweeps.show.sections import (
     STUDIES,
     TableSection,
     claims_of,
     markdown,
     networks_section,
+    number_of,
     paper_section,
+    public,
     runs_section,
 )
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TEMPLATES = Path(__file__).with_name("templates")
 # Scales in the order in which their verdicts count more.
 SCALES = ("smoke", "demo", "bench", "real", "paper")
-
-# A path from the root of a machine; addresses of pages and relative paths do not match.
-ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 
 # Beginning of markup that is not ours, such as an element in a text of a run.
 MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
 
 # Numbers in a page written by hand, between two comments.
 MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL)
-
-FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
 
 
 class Report:
@@ -79,6 +73,7 @@ class Report:
     """
 
     def __init__(self, runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -> None:
+        self.runs_dir, self.resamples = runs_dir, resamples
         self.texts = read_yaml(TEMPLATES / "pages.yaml")
         self.runs = finished_runs(runs_dir, archive)
         self.reader = RunReader(self.runs)
@@ -125,6 +120,11 @@ class Report:
         ]
 
     @property
+    def waiting(self) -> list[TableSection]:
+        """The tables that could be run, and have no run yet."""
+        return [table for table in self.tables if not (table.is_run or table.is_printed)]
+
+    @property
     def limits(self) -> list[str]:
         """What the verdicts do not say, one sentence or two each."""
         judged = self.claims[self.claims["verdict"] != NOT_RUN]
@@ -160,13 +160,6 @@ class Report:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        own = [table for table in self.tables if table.is_run]
-        of_papers = []
-        for table in self.tables:
-            if not table.is_run and table.page in self.texts["papers"]:
-                of_papers.append(table)
-            elif not table.is_run and table.page != STUDIES:
-                own.append(table)
         data = {
             **self.data,
             "num_runs": len(self.runs),
@@ -178,8 +171,8 @@ class Report:
             "agreement": self.agreement,
             "signs": markdown(signs_grid(self.contrasts)),
             "ranks": markdown(ranks_grid(self.ranks)),
-            "own": own,
-            "papers_tables": of_papers,
+            "were_run": [table for table in self.tables if table.is_run],
+            "waiting": self.waiting,
             "studies": self.studies.items(),
             "any_verdict": bool((self.claims["verdict"] != NOT_RUN).any()),
         }
@@ -193,7 +186,7 @@ class Report:
         template = environment.get_template("pages.md.j2")
         text = template.render(data=data, page=name, paper=papers.get(name))
         text = re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
-        return MARKUP.sub("&lt;", ABSOLUTE.sub(r".../\1", without_passwords(text)))
+        return MARKUP.sub("&lt;", public(text))
 
     def pages(self) -> dict[str, str]:
         """Return every page of ``docs/results`` by its file; those of a user's tables too."""
@@ -209,40 +202,20 @@ class Report:
 
     def html(self) -> str:
         """Return all of it as one file, which loads nothing and runs only its own script."""
-        from markdown_it import MarkdownIt
-
-        text = re.sub(r"<!--.*?-->\n", "", self.page("all"))
-        reader = MarkdownIt("commonmark", {"html": False}).enable("table")
-        body = ""
-        for place, part in enumerate(FOLDED.split(text)):  # every second part is a tag
-            body += part if place % 2 else reader.render(part)
-        body = body.replace("<table>", '<div class="scroll"><table>')
-        body = body.replace("</table>", "</table></div>")
-        for name, content in self.images.items():
-            address = f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
-            body = body.replace(f'src="{name}"', f'src="{address}"')
-        script = (TEMPLATES / "sort.js").read_text()
-        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        shell = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
-        page = shell.get_template("page.html.j2")
-        return page.render(body=body, script=script, hash=f"sha256-{digest}")
+        own = own_section(self.runs, self.reader, self.runs_dir, self.resamples, self.remarks)
+        left = int((self.claims["verdict"] == NOT_RUN).sum()), len(self.waiting)
+        own["left"] = f"{number_of(left[0], 'claim')} and {number_of(left[1], 'table')}"
+        return html_page(own, self.page("all"), self.page("not-run"), self.images)
 
     @cached_property  # a second drawing has another layout
     def images(self) -> dict[str, bytes]:
         """The figures of the pages that were made, as SVG by the names of their files."""
-        from analysis.figures.plots import save
+        from analysis.figures.plots import content_of
 
-        with tempfile.TemporaryDirectory() as folder:
-            for table in self.tables:
-                if table.drawn is not None:
-                    save(table.drawn, Path(folder, table.figure))
-            for paper in self.papers:
-                if paper["forest"] is not None:
-                    save(paper["forest"], Path(folder, paper["picture"]))
-            sides = sides_figure(self.contrasts, REAL)
-            if sides is not None:
-                save(sides, Path(folder, "real-images_contrasts.svg"))
-            return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+        drawn = {table.figure: table.drawn for table in self.tables}
+        drawn |= {paper["picture"]: paper["forest"] for paper in self.papers}
+        drawn["real-images_contrasts.svg"] = sides_figure(self.contrasts, REAL)
+        return {name: content_of(found, "svg") for name, found in drawn.items() if found}
 
     def filled(self, text: str) -> str:
         """Return a page written by hand with its marked numbers made again.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from rgbt.config.compose import DEFAULT_SCALE
 from rgbt.metrics import names
 from rgbt.metrics.named import value
 from rgbt.runs.folder import GROUP
-from rgbt.runs.provenance import commit_of
+from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.judge.agreement import signs_of
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 STUDIES = "studies"
 METRICS = (names.MIOU, names.VAR)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
+# A path from the root of a machine; addresses of pages and relative paths do not match.
+ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 # Errors that a record may raise that somebody has edited.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 
@@ -218,11 +221,9 @@ def _origin(run: RunResult) -> dict[str, str | None]:
 
 def _runs_of_kind(images: str, scale: str, runs: pd.DataFrame) -> str:
     """The runs on one kind of images at one scale, a line for each method and data set."""
-    methods = [method.split() for method in runs["method"]]
-    shared = [word for word in methods[0][1:] if all(word in words for words in methods)]
+    named, shared = short_names(runs["method"])
     lines = []
     for (method, _), group in runs.groupby(["method", "dataset"]):
-        own = " ".join(word for word in method.split() if word not in shared)
         seeds = ", ".join(map(str, sorted(group["seed"])))
         scores = []
         for name in METRICS:
@@ -230,13 +231,34 @@ def _runs_of_kind(images: str, scale: str, runs: pd.DataFrame) -> str:
             scores.append(f"{number(group[name].mean())}{spread}")
         tables = dict.fromkeys(group["tables"].explode().dropna())
         time = duration(group["time"].median())
-        lines.append((f"`{own}`", seeds, *scores, time, "; ".join(tables)))
+        lines.append((f"`{named[method]}`", seeds, *scores, time, "; ".join(tables)))
     header = ("method", "seeds", *METRICS, "time", "rows of")
     hours = duration(runs["time"].sum())
-    title = f"{len(runs)} runs on {images}, scale={scale}, {hours} in all"
+    title = f"{number_of(len(runs), 'run')} on {images}, scale={scale}, {hours} in all"
     grid = markdown(TextTable(title, header, tuple(lines)))
     common = " ".join(word for word in shared if word != f"scale={scale}")
     return f"{grid}\n\nAll of them with `{common}`." if common else grid
+
+
+def short_names(methods: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+    """Return names of methods without the overrides that all of them have, and these."""
+    words = {method: method.split() for method in methods}
+    first = next(iter(words.values()))
+    shared = [word for word in first[1:] if all(word in others for others in words.values())]
+    named = {}
+    for method, of_method in words.items():
+        named[method] = " ".join(word for word in of_method if word not in shared)
+    return named, shared
+
+
+def public(text: str) -> str:
+    """Return a text without passwords, and with the last part alone of absolute paths."""
+    return ABSOLUTE.sub(r".../\1", without_passwords(text))
+
+
+def number_of(count: int, noun: str) -> str:
+    """Write "1 run", "2 runs"."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def networks_section(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:

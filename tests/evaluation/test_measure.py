@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from analysis.figures.page import stored_pictures
 from rgbt import evaluate
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.scores import extremes
 from tests.commands import Call, Trained, short
 from tests.measured import measurement
 
@@ -23,9 +25,12 @@ def test_details_leave_the_counts_that_are_there(
     own = Counts.load(run / "counts_test.npz")
     other = replace(own, counts=own.counts[..., ::-1])
     other.save(run / "counts_test.npz")
-    for _ in range(2):
+    for is_again in (False, True):
         code, out, err = call(evaluate.entry, f"run={run}", "details=boundary")
         assert code == 0, err
+        assert ("best.png" in err) != is_again, "pictures that are missing are drawn"
+        name, _, _ = stored_pictures(run / "figures" / "best.png")
+        assert name == extremes(other)["best"][0]
         kept = Counts.load(run / "counts_test.npz")
         assert np.array_equal(kept.counts, other.counts)
         assert [path.name for path in (run / "evaluations").iterdir()] == [

@@ -173,3 +173,26 @@ def test_means_over_one_labelled_class_are_undefined() -> None:
             f"labels of a single class in {where}{end}"
         )
         assert not any(note.endswith(end) for note in scores.absent_notes(*settings, "released"))
+
+
+def test_extremes_by_hand() -> None:
+    """Two classes with 100 pixels each, so many of them right: IoU = right / (200 - right)."""
+
+    def counts(*right: int) -> Counts:
+        array = np.array([[[[n, 100 - n], [100 - n, n]]] for n in right])
+        names = tuple(f"image{number}" for number in range(len(right)))
+        about = {"classes": ("a", "b"), "measurement": measurement(partition="ring1")}
+        kept = (np.array(right) >= 0)[:, None, None, None]
+        return Counts(counts=array * kept, names=names, night=None, **about)
+
+    found = scores.extremes(counts(50, 80, -1, 20, 100))  # the third one has no label
+    assert [*found] == ["best", "median", "worst"]
+    assert {word: name for word, (name, _) in found.items()} == {
+        "best": "image4",
+        "median": "image1",
+        "worst": "image3",
+    }
+    assert [score for _, score in found.values()] == pytest.approx([100, 8000 / 120, 2000 / 180])
+    assert scores.extremes(counts(20, 50)).keys() == {"best", "worst"}
+    assert scores.extremes(counts(20)).keys() == {"best"}
+    assert scores.extremes(counts(-1)) == {}

@@ -15,10 +15,11 @@ from analysis.predictions.scoring import score_folder
 from analysis.statistics.collect import SpatialStatistics
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import RunFolder
 from tests.analysis.counts import counts_of
 from tests.analysis.figures.drawn import statistics, strips
 from tests.analysis.figures.framed import write_framed
-from tests.analysis.robust_runs import SCORES, write_levels
+from tests.analysis.robust_runs import SCORES, write_levels, write_run
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call
 from tests.measured import remeasured
@@ -49,6 +50,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pairs_of(12, agree).save(folder / method / "pairs.npz")
         write_levels(folder / method / "failing", SCORES)
     write_framed(folder / "framed")
+    write_run(folder, "run", "trained", 0, SCORES)
+    RunFolder(folder / "run").append(10, "train", {"loss": 1.0})
     return folder
 
 
@@ -92,6 +95,7 @@ def arguments(figure: str, folder: Path) -> list[str]:
             f"methods=A:{folder / 'framed' / 'a'},B:{folder / 'framed' / 'b'}",
         ],
         "two": ["rows=2"],
+        "trained": [f"runs=A:{folder / 'run'}"],
     }
     needed = {
         "spatialseg/fig1": ("map folder", "statistics folder"),
@@ -111,6 +115,8 @@ def arguments(figure: str, folder: Path) -> list[str]:
         "multihead/fig3": (),
         "robustness": ("failing",),
         "regions/heat": ("runs",),
+        "classes": ("runs",),
+        "curves": ("trained",),
         "regions/profile": ("runs", "fast"),
     }
     return [word for name in needed[figure] for word in given[name]]

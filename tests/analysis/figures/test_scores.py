@@ -11,8 +11,13 @@ import pytest
 from analysis.figures.inputs import check_same_images
 from analysis.figures.scores import (
     class_consistency,
+    class_means,
     corrupted,
+    corruption_means,
+    curve_points,
+    draw_bars,
     draw_consistency,
+    draw_curves,
     draw_heat,
     draw_profiles,
     draw_robustness,
@@ -24,6 +29,7 @@ from analysis.results import Levels, trainings
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import MetricLine
 from tests.analysis.counts import counts_of
 from tests.analysis.figures.drawn import letters, strips, texts
 from tests.analysis.robust_runs import SCORES, less, write_levels
@@ -152,6 +158,34 @@ def test_profiles_say_what_their_intervals_cover(tmp_path: Path, number: int) ->
     assert len(figure.axes[0].collections) == number  # bands of two, bars of three
 
 
+def test_bars_of_classes_are_means_over_seeds(tmp_path: Path) -> None:
+    first = counts_of(np.array([[[6, 2], [0, 2]]]), unscored=("class1",))
+    second = counts_of(np.array([[[8, 0], [1, 1]]]), unscored=("class1",))
+    frame = class_means({"grbm": [first, second], "crm": [second]}, "released")
+    assert frame["tick"].tolist() == [*["class0"] * 2, *["class1 (not in means)"] * 2]
+    values = [(75 + 800 / 9) / 2, 800 / 9, (50 + 50) / 2, 50]
+    np.testing.assert_allclose(frame["value"], values)
+    found = texts(draw_bars(frame, "IoU (%)"), tmp_path)
+    assert {"class0", "grbm", "crm", "IoU (%)", "88.9", "50.0"} <= set(found)
+
+
+def test_curves_have_a_panel_for_loss_and_validation(tmp_path: Path) -> None:
+    lines = [
+        MetricLine(10, "train", 0.0, {"loss": 2.0}),
+        MetricLine(10, "val", 0.0, {"mIoU": 0.25}),
+        MetricLine(20, "train", 0.0, {"loss": 1.0}),
+        MetricLine(20, "test", 0.0, {"mIoU": 0.5}),
+    ]
+    frame = curve_points({"a $cost": lines, "b": lines[:1]})
+    assert frame[["series", "x", "value"]].to_numpy().tolist() == [
+        *(["a $cost", 10, 2.0], ["a $cost", 10, 25.0], ["a $cost", 20, 1.0], ["b", 10, 2.0])
+    ]
+    found = texts(draw_curves(frame), tmp_path)
+    assert {"training loss", "validation mIoU (%)", "step", "a $cost", "b"} <= set(found)
+    with pytest.raises(InputError, match="no loss and no validation"):
+        curve_points({"a": lines[3:]})
+
+
 # Corruptions.
 
 
@@ -188,6 +222,12 @@ def test_mean_deviation_and_share_of_clean(methods) -> None:
     assert np.isnan(single["mIoU_sd"])
     shown = corrupted(methods, "released", ["rgb_removed"])
     assert [*shown["row"].unique()] == ["clean", "rgb_removed"]
+
+
+def test_bars_of_corruptions_are_means_over_severities(methods) -> None:
+    frame = corruption_means(corrupted(methods, None)).set_index(["tick", "series"])["value"]
+    assert frame["noise, RGB and thermal", "CRM"] == pytest.approx((55 + 35) / 2, abs=1e-3)
+    assert frame["clean", "RTFNet"] == pytest.approx(60, abs=1e-3)
 
 
 @pytest.mark.parametrize("score", ["mIoU", "relative"])

@@ -1,0 +1,190 @@
+"""Own runs at the top of the HTML page: what is shown of them, and how a browser shows it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.results import finished_runs
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.scores import extremes
+from rgbt.runs.folder import RunFolder, read_description
+from rgbt.tracking.pictures import write_strip
+from rgbt.types import Sample
+from sweeps.score.reader import RunReader
+from sweeps.show.html import html_page
+from sweeps.show.own import own_section
+from tests.browser import CHROMIUM, open_page
+from tests.measured import store
+from tests.sweeps.show.planted import plant
+
+TABLE3 = {"CRM baseline": (50.0, 51.0), "Ny/4": (60.0,)}
+DATASET: Any = SimpleNamespace(classes=("road", "car"), palette=((0, 0, 0), (64, 0, 128)))
+
+
+def finish(folder: Path, time: int) -> None:
+    """Give a planted run what its training leaves: a log, and pictures of three images."""
+    run = RunFolder(folder)
+    for step in (10, 20):
+        run.append(step, "train", {"loss": 1 / step})
+        run.append(step, "val", {"mIoU": step / 100})
+    lines = [replace(line, time=float(time)).text() for line in run.lines()]
+    (folder / "metrics.jsonl").write_bytes(b"".join(lines))
+    rng = np.random.default_rng(time)
+    for word, (name, _) in extremes(Counts.load(folder / "counts_test.npz")).items():
+        rgb = rng.integers(0, 255, (24, 32, 3)).astype(np.uint8)
+        label = rng.integers(0, 2, (24, 32)).astype(np.uint8)
+        sample = Sample(rgb=rgb, thermal=rgb[..., 0], label=label, name=name)
+        write_strip(sample, label, DATASET, run.figure_path(word))
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory, composed_once: None) -> Path:
+    """Three runs of two methods, the last one the newest and measured under corruptions."""
+    root = tmp_path_factory.mktemp("own")
+    folders = plant(root / "runs", "spatialseg/table3", TABLE3)
+    for time, folder in enumerate(folders, 1):
+        finish(folder, time)
+    counts = Counts.load(folders[-1] / "counts_test.npz")
+    shown = {"corruption": "noise", "title": "noise, RGB", "unit": "grey levels"}
+    store(folders[-1], counts, severity=8.0, **shown)
+    return root / "runs"
+
+
+@pytest.fixture
+def runs(planted: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(planted, tmp_path / "runs"))
+
+
+def section(runs: Path) -> tuple[dict[str, Any], list[str]]:
+    found, remarks = finished_runs(runs, runs / "none"), []
+    return own_section(found, RunReader(found), runs, 100, remarks), remarks
+
+
+def page(own: dict[str, Any], texts: Sequence[str] = ("", "- one")) -> str:
+    return html_page({**own, "left": "2 claims and 1 table"}, *texts, {})
+
+
+def test_newest_run_comes_first_with_its_images_and_charts(runs: Path) -> None:
+    own, remarks = section(runs)
+    assert remarks == []
+    assert own["range"] == " to ".join(sorted(own["range"].split(" to "))), "lowest to highest"
+    newest, second, third = own["pictured"]
+    assert newest["miou"] > max(second["miou"], third["miou"])
+    assert {second["label"][-6:], third["label"][-6:]} == {"seed 0", "seed 1"}
+    assert "seed" not in newest["label"]
+    assert [image["word"] for image in newest["images"]] == ["best", "median", "worst"]
+    of = extremes(newest["counts"])
+    assert [(each["name"], float(each["score"])) for each in newest["images"]] == [
+        (name, pytest.approx(score, abs=0.005)) for name, score in of.values()
+    ]
+    (kind,) = own["kinds"]
+    titles = ["mIoU by region", "IoU by class", "Learning curves", "mIoU under corruptions"]
+    assert [title for title, _ in kind["charts"]] == titles
+    text = page(own)
+    assert text.index(newest["key"]) < text.index(second["key"])
+    assert (
+        f"3 runs in the folder of runs, newest first; mIoU on the test images: <b>{own['range']}"
+        in text
+    )
+
+
+def test_one_run_is_one_run_and_none_names_a_command(runs: Path, tmp_path: Path) -> None:
+    for folder in [path.parent for path in sorted(runs.glob("*/run.json"))][1:]:
+        shutil.rmtree(folder)
+    assert "<p>1 run in " in page(section(runs)[0])
+    assert "rgbt run +experiment=grbm" in page(section(tmp_path / "nothing")[0])
+
+
+def test_missing_wrong_and_damaged_things_are_named(runs: Path) -> None:
+    newest = section(runs)[0]["own"][0]["run"].folder
+    figures = newest / "figures"
+    (figures / "median.png").unlink()
+    (figures / "worst.png").write_bytes((figures / "best.png").read_bytes())
+    (newest / "metrics.jsonl").write_text('{"step": 1}\n')
+    others = [path.parent for path in runs.glob("*/run.json") if path.parent != newest]
+    (others[0] / "figures" / "best.png").write_text("no image")
+    (others[1] / "result.json").unlink()
+    own, remarks = section(runs)
+    assert [remark for remark in remarks if f"Learning curve of {newest.name}" in remark]
+    found = {run["key"]: run for run in own["pictured"]}
+    assert len(found) == 2
+    spoilt = found[newest.name]
+    assert spoilt["missing"][0] == "median.png is missing"
+    assert spoilt["missing"][1].startswith("worst.png is of '")
+    assert "best.png cannot be decoded" in found[others[0].name]["missing"][0]
+    (unfinished,) = own["unfinished"]
+    assert unfinished.startswith(f"{others[1].name} is not finished: ")
+    assert "step 20 of " in unfinished
+    text = page(own)
+    assert f"<code>rgbt evaluate run={newest.name}</code>" in text
+    assert unfinished.split(":")[0] in text
+
+
+def test_text_of_a_run_is_no_markup(runs: Path) -> None:
+    for path in runs.glob("*/run.json"):
+        known = read_description(path.parent)
+        assert known is not None
+        evil = "_<img src=http://evil.example/x.png> $x^{"
+        described = replace(known, tags={**known.tags, "rgbt.group": evil})
+        RunFolder(path.parent).describe(described)
+    own, remarks = section(runs)
+    assert remarks == []
+    image = "![x](http://evil.example/y.png) <b onclick=a>"
+    text = page(own, (image, image))
+    assert "<img src=http" not in text
+    assert 'src="http' not in text
+    assert "<b onclick" not in text
+    assert "<h2>_&lt;img" in text
+
+
+LOOK = """(() => {
+  const charts = [...document.querySelectorAll("svg.chart")], images = [...document.images];
+  const seen = (text) => text.getBBox().width > 0 && text.getBBox().height > 0;
+  const loaded = performance.getEntriesByType("resource").map((entry) => entry.name);
+  const ink = getComputedStyle(document.querySelector("svg.chart text")).fill;
+  return {
+    ink,
+    width: document.documentElement.scrollWidth,
+    pictures: images.length,
+    broken: images.filter((i) => !(i.complete && i.naturalWidth && i.alt)).map((i) => i.src),
+    charts: charts.length,
+    bare: charts.filter((c) => ![...c.querySelectorAll("text")].some(seen)).length,
+    first: document.querySelector(".facts b").getBoundingClientRect().bottom,
+    loaded: loaded.filter((name) => !name.startsWith("data:")),
+    page: getComputedStyle(document.body).backgroundColor,
+  };
+})()"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
+def test_page_is_readable_in_a_browser(runs: Path, tmp_path: Path) -> None:
+    """At the width of a telephone and of a laptop, in light and dark: whole, and nothing loaded."""
+    wide = "| " + " | ".join(f"column {number}" for number in range(30)) + " |\n"
+    rest = f"# Runs\n\n{wide}{'|---' * 30}|\n{wide}\n`{'x' * 300}`\n"
+    path = tmp_path / "index.html"
+    path.write_text(page(section(runs)[0], (rest, "- one")))
+    inks = set()
+    with open_page(tmp_path / "profile") as shown:
+        shown.go(path.as_uri(), "document.readyState == 'complete'")
+        for width in (390, 1280):
+            for scheme in ("light", "dark"):
+                shown.size(width, 800)
+                feature = {"name": "prefers-color-scheme", "value": scheme}
+                shown.call("Emulation.setEmulatedMedia", features=[feature])
+                look = shown.value(LOOK)
+                assert look["width"] <= width
+                assert (look["broken"], look["bare"], look["loaded"]) == ([], 0, [])
+                assert (look["pictures"], look["charts"]) == (36, 4)
+                assert look["first"] < 800, "an own number is on the first screen"
+                inks.add((scheme, look["ink"], look["page"]))
+    assert len(inks) == 2, "a dark page has bright letters in its charts"
+    assert len({ink for _, ink, _ in inks}) == len({ground for *_, ground in inks}) == 2
