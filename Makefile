@@ -1,5 +1,5 @@
-# make demo       install, train GRBM on the embedded data set, print the per-region table
-# make test       install, lint-free default test suite (offline, two cores, minutes)
+# make demo       install rgbt, train GRBM on the embedded data set, print the per-region table
+# make test       install the tools too, lint-free default test suite (offline, two cores, minutes)
 # make test-all   every test: the slow ones, the pages, SLURM, Ray and an MLflow server on loopback
 # make lint       formatting, lint, types, spelling
 # make results  rewrites docs/results, its figures and the marked numbers from the archive results/
@@ -26,12 +26,14 @@ TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt swee
 # Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
 MARKED := README.md,docs/results/findings.md,docs/results/spatial-bias.md
 
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
 # gpu-check with BIN=/some/env/bin uses that environment, and installs nothing.
 READY := $(if $(filter command line,$(origin BIN)),,$(VENV)/.ready)
 
 .PHONY: demo test test-all lint docs site results mutants bench gpu-check
 
-demo: $(VENV)/.ready
+demo: $(VENV)/.installed
 	$(BIN)/python -m rgbt.run +experiment=grbm
 
 test: $(VENV)/.ready
@@ -75,7 +77,13 @@ bench: $(VENV)/.ready
 gpu-check: $(READY)
 	$(BIN)/python -m tests.benchmarks.gpu_check $(if $(RELEASE),release=$(RELEASE)) $(WORDS)
 
+# What a user needs; `.ready` has the tools of the tests and the pages on top.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) -e .
+	touch $@
+
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
-	touch $@
+	$(INSTALL) -e ".[dev]"
+	touch $(VENV)/.installed $@

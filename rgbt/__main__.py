@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import rgbt
@@ -21,8 +22,11 @@ usage: rgbt COMMAND [key=value ...]
 {commands}
 
 rgbt COMMAND --help shows its options. Start with: rgbt run +experiment=grbm
-rgbt --version shows the version.
+rgbt --all shows all {number} commands, rgbt --version the version.
 """
+
+# What a first day needs, in its order.
+FIRST = ("run", "predict", "compare", "check", "ui", "doctor")
 
 
 def main() -> None:
@@ -34,7 +38,9 @@ def main() -> None:
         sys.argv[1:] = words
         runpy.run_module(COMMANDS[name].module, run_name="__main__", alter_sys=True)
     elif name in ("-h", "--help"):
-        sys.stdout.write(help_text())
+        sys.stdout.write(help_text(FIRST))
+    elif name == "--all":
+        sys.stdout.write(help_text(COMMANDS))
     elif name in ("-V", "--version"):
         sys.stdout.write(f"rgbt {rgbt.__version__}\n")
     else:
@@ -42,11 +48,11 @@ def main() -> None:
     sys.exit(code)
 
 
-def help_text() -> str:
-    """Return what ``rgbt --help`` shows: every command with one line."""
+def help_text(names: Iterable[str]) -> str:
+    """Return what ``rgbt --help`` shows: one line about each of these commands."""
     width = 2 + max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}{entry.about}" for name, entry in COMMANDS.items()]
-    return HELP.format(commands="\n".join(lines))
+    lines = [f"  {name:<{width}}{COMMANDS[name].about}" for name in names]
+    return HELP.format(commands="\n".join(lines), number=len(COMMANDS))
 
 
 if __name__ == "__main__":

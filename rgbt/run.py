@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 @command(sweeper="study")
 def main(config: DictConfig, overrides: list[str]) -> int:
-    """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
+    """Train the upstream runs and the run, evaluate its checkpoint on the test split.
+
+    With -m, a grid (key=1,2) or a search. The same command resumes an unfinished run.
+    """
     from rgbt.runs.naming import tags_from_environment
     from rgbt.runs.specify import requested_run
     from rgbt.runtime.group import group_from_environment

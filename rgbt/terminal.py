@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,6 +53,28 @@ def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
     """List paths, commands and addresses, one "name  path" pair per line."""
     width = max(len(name) for name, _ in paths)
     return plain_text("\n".join(f"{name:<{width}}  {path}" for name, path in paths))
+
+
+def shell_command(*words: str) -> str:
+    """Write a command of rgbt so that it can be pasted into the shell that started this process.
+
+    That is ``rgbt ...`` where the shell finds this environment's own one, else its path from the
+    working folder (``.venv/bin/rgbt ...``), or Python itself where rgbt was not installed.
+    """
+    script = Path(sys.executable).parent / "rgbt"
+    found = shutil.which("rgbt")
+    if found is not None and script.exists() and Path(found).samefile(script):
+        start = ["rgbt"]
+    else:
+        python = _from_here(Path(sys.executable))
+        start = [_from_here(script)] if script.exists() else [python, "-m", "rgbt"]
+    return shlex.join([*start, *words])
+
+
+def _from_here(path: Path) -> str:
+    """Write a path relative to the working folder if that is shorter and leads nowhere else."""
+    here = Path(os.environ.get("PWD") or Path.cwd())
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
 def result_view(

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from rgbt import __version__
-from rgbt.__main__ import help_text, main
+from rgbt.__main__ import FIRST, main
 from rgbt.checks import InputError, RunError
+from rgbt.config.command import configuration_help
+from rgbt.config.compose import available, groups
 from rgbt.config.plain_command import COMMANDS, exit_code
 from tests.commands import Call, assert_one_sentence
 
@@ -28,10 +30,16 @@ def python(folder: Path, *words: str, **environment: str) -> subprocess.Complete
     return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True)
 
 
-def test_help_lists_every_command_and_its_module_exists() -> None:
-    shown = help_text()
-    for name, entry in COMMANDS.items():
-        assert f"\n  {name} " in shown
+@pytest.mark.parametrize("words", [(), ("--help",), ("-h",), ("--all",)])
+def test_help_lists_the_commands_of_a_first_day_or_all(words: tuple[str, ...], call: Call) -> None:
+    code, out, _ = call(main, *words)
+    listed = tuple(line.split()[0] for line in out.splitlines() if line.startswith("  "))
+    assert (code, listed) == (0, tuple(COMMANDS) if words == ("--all",) else FIRST)
+    assert len(FIRST) == 6
+
+
+def test_module_of_every_command_exists() -> None:
+    for entry in COMMANDS.values():
         text = (ROOT / f"{entry.module.replace('.', '/')}.py").read_text()
         assert 'if __name__ == "__main__"' in text, entry.module
 
@@ -56,9 +64,7 @@ def test_command_explains_itself_and_refuses_a_wrong_option(
     monkeypatch.chdir(tmp_path)
     code, out, err = call(main, name, "--help")
     assert (code, err) == (0, "")
-    assert (
-        "rgbt run" if name in ("run", "check", "masks") else f"usage: rgbt {name} "
-    ) in out or name == "weights"
+    assert f"usage: rgbt {name} " in out or name == "weights"
     words = {
         "weights": ("inspect", "x.pth"),
         "archive": ("check",),
@@ -68,6 +74,20 @@ def test_command_explains_itself_and_refuses_a_wrong_option(
         code, out, err = call(main, *given)
         assert (code, out) == (2, "")
         assert_one_sentence(err, "'spilt'" if given[0] == name else f"'{name}x?[2J' is not a comm")
+
+
+def test_help_of_run_lists_the_choices_that_hydra_finds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "experiment" / "mine.yaml"
+    own.parent.mkdir()
+    own.write_text("_variants_: {one: {}, two: {}}\n")
+    monkeypatch.setenv("RGBT_CONF", str(tmp_path))
+    lines = " ".join(configuration_help(lambda config, words: None).split())
+    for group in set(groups()) - {"hydra"}:
+        assert f" {group}: {', '.join(available(group))} " in lines
+    assert " model/inputs: caffe, " in lines
+    assert "mine_one, mine_two" in lines
 
 
 def test_exit_code_of_an_error() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -17,21 +20,36 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.compose import (
     OWN_FOLDERS,
     check_keys,
+    choices_in,
     composed,
     conf_dir,
     own_folders,
+    own_paths,
     register_resolvers,
     searching,
 )
-from rgbt.config.options import readable_paths
+from rgbt.config.options import WIDTH, readable_paths
 from rgbt.config.overrides import check_words
-from rgbt.config.plain_command import exit_code
+from rgbt.config.plain_command import HELP, exit_code, name_of
 from rgbt.runtime.group import taking_part
 from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")
 ONE_RUN = {"-r", "--run"}  # what is done without them
 LAUNCHED = re.compile(r"\+*hydra/launcher=(?!['\"]?basic['\"]?$)")  # also one run is a job
+
+CHOICES = "Choices of each group (experiment, search and debug take a plus):"
+EXAMPLES = """\
+A run:           rgbt run +experiment=grbm
+Real data:       rgbt run +experiment=grbm dataset=mfnet dataset.root=/data/MFNet
+Paper settings:  add scale=paper
+A grid:          rgbt run -m +experiment=grbm masker.sigma_div=1,2,4
+A search:        rgbt run -m +search=grbm
+A job of SLURM:  add hydra/launcher=submitit_slurm to any of them
+A table:         rgbt reproduce table=spatialseg/table3 seeds=3
+A data set:      rgbt check dataset=mfnet dataset.root=/data/MFNet
+To print the whole configuration of a command, add --cfg job. Rerun a command to resume it.
+"""
 
 Main = Callable[[DictConfig, list[str]], int | None]
 
@@ -48,6 +66,9 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
 
         def run(words: list[str]) -> int | None:
             check_words(words)
+            if set(words) & set(HELP):
+                sys.stdout.write(configuration_help(main))
+                return None
             options = {word for word in words if word.startswith("-")}
             if options <= ONE_RUN:
                 words = [word for word in words if word not in options]
@@ -128,6 +149,32 @@ class GridPoint:
         self.main, self.codes = state["main"], None
         os.environ[OWN_FOLDERS] = state[OWN_FOLDERS]
         register_resolvers()
+
+
+def configuration_help(main: Main) -> str:
+    """Return the text of ``--help`` of a command whose words are all overrides.
+
+    Hydra lists the same choices in three times as long, for it composes the configuration first.
+    """
+    folders = [conf_dir(), *(Path(path.removeprefix("file://")) for path in own_paths())]
+    choices: dict[str, set[str]] = {}
+    for group, files in ((g, f) for folder in folders for g, f in _groups_of(folder)):
+        choices.setdefault(group, set()).update(files)
+    fill = textwrap.TextWrapper(
+        WIDTH, subsequent_indent="    ", break_on_hyphens=False, break_long_words=False
+    ).fill
+    lines = [fill(f"  {group}: {', '.join(sorted(choices[group]))}") for group in sorted(choices)]
+    usage = f"usage: {name_of(main.__module__)} [group=choice ...] [key=value ...]"
+    about, listed = inspect.getdoc(main) or "", "\n".join(lines)
+    return f"{about}\n\n{usage}\n\n{CHOICES}\n{listed}\n\n{EXAMPLES}"
+
+
+def _groups_of(folder: Path) -> Iterator[tuple[str, set[str]]]:
+    """Yield the groups in a folder of configuration files, with their choices; not Hydra's own."""
+    for path in folder.rglob("*"):
+        group = path.relative_to(folder).as_posix()
+        if path.is_dir() and group.partition("/")[0] != "hydra" and (found := choices_in(path)):
+            yield group, found
 
 
 def _of_runs(words: Sequence[str]) -> list[str]:

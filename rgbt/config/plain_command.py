@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -53,6 +53,7 @@ COMMANDS = {
     "archive": Entry("analysis.archive", "keep the results of runs in the repository"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
+    "doctor": Entry("rgbt.doctor", "show what this installation has, for a bug report"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
 }
 
@@ -98,6 +99,14 @@ def _with_setting(file: str) -> str:
     return found if found.endswith(f"={file}") else f"{found}: {file}".removeprefix(": ")
 
 
+def name_of(module: str) -> str:
+    """Return how a user types the command of a module: "rgbt check" of "rgbt.data.check"."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    module = spec.name if module == "__main__" and spec else module
+    names = {entry.module: f"rgbt {name}" for name, entry in COMMANDS.items()}
+    return names.get(module, module)
+
+
 def say(sentence: str, code: int) -> int:
     """Print a message on stderr and return `code`."""
     with suppress(OSError):  # output may go to a file on a disk that is full
@@ -130,18 +139,21 @@ class PlainCommand(Generic[T]):
         """Run with the words of ``sys.argv``; a mistake is one sentence on stderr."""
         words = sys.argv[1:]
         if set(words) & set(HELP):
-            modules = {entry.module: f"rgbt {name}" for name, entry in COMMANDS.items()}
-            spec, module = getattr(sys.modules["__main__"], "__spec__", None), self.main.__module__
-            module = spec.name if module == "__main__" and spec else module
-            usage = f"{self.name or modules.get(module, module)} {self.first.upper()}".strip()
+            usage = f"{self.name or name_of(self.main.__module__)} {self.first.upper()}".strip()
             about = inspect.getdoc(self.main) or ""
             sys.stdout.write(f"{help_text(usage, self.options, about, self.first)}\n")
             sys.exit(0)
-        from rgbt.config.compose import searching  # --help does not wait for Hydra
-
-        with answered(), searching(words):
+        with answered(), self._searching(words):
             code = exit_code(lambda: self.run(words))
         sys.exit(code)
+
+    def _searching(self, words: Sequence[str]) -> AbstractContextManager[None]:
+        """Use the search path in `words`; without Hydra for a command that composes nothing."""
+        if self.heeds is not None and not self.heeds:
+            return nullcontext()
+        from rgbt.config.compose import searching  # --help does not wait for Hydra
+
+        return searching(words)
 
     def run(self, words: Sequence[str]) -> int | None:
         """Parse `words` (see `rgbt.config.options.parse`) and do it."""

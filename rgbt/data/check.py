@@ -92,7 +92,7 @@ class DatasetReport:
 
 @command()
 def main(config: DictConfig, _overrides: list[str]) -> int:
-    """Check ``config.dataset``; returns 1 if there are problems."""
+    """Read every file of the data set and report its problems; exit code 1: there are some."""
     dataset = build(config.dataset)
     if not isinstance(dataset, FileDataset):
         raise InputError(

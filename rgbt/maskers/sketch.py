@@ -66,7 +66,7 @@ def draw(masker: AnyMasker, examples: Sequence[Example], seed: int, title: str) 
 
 @command()
 def main(config: DictConfig, _overrides: list[str]) -> int:
-    """Write the picture of the configured masker to `out`."""
+    """Draw what the masker hides in training images, in the file out=masks.png."""
     path = Path(config.out or "")
     if path.suffix != ".png":
         raise InputError(f"out must be a PNG file, such as out=masks.png, got {config.out}.")

@@ -7,7 +7,6 @@ store comes from the configuration, never from a run folder.
 from __future__ import annotations
 
 import math
-import shlex
 import sys
 import time
 from dataclasses import replace
@@ -17,6 +16,7 @@ from rgbt.checks import InputError
 from rgbt.ranges import Text
 from rgbt.runs.folder import Description, RunFolder, read_description, shown_key
 from rgbt.runs.provenance import without_passwords
+from rgbt.terminal import shell_command
 from rgbt.tracking.mlflow_client import (
     ARTIFACTS,
     SQLITE,
@@ -105,11 +105,11 @@ class MlflowTracking(Tracking):
 
     def ui_command(self) -> str:
         """Return the command that opens the pages of this store."""
-        return shlex.join(["rgbt", "ui", *self._words])
+        return shell_command("ui", *self._words)
 
     def _later(self) -> str:
         named = [word for word in self._words if not word.startswith("runs_dir=")]
-        return shlex.join(["rgbt", "sync", f"run={self._folder.path}", *named])
+        return shell_command("sync", f"run={self._folder.path}", *named)
 
     def sync(self, folder: RunFolder, status: Status) -> str:
         """Bring this store up to date; return the id of the MLflow run. Raises what it raises."""

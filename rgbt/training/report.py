@@ -28,6 +28,7 @@ from rgbt.runs.run_spec import RunSpec
 from rgbt.tables import ResultTables, percent, subset_mious
 from rgbt.terminal import info, path_lines, print_rich, result_view, warn
 from rgbt.tracking.tracker import Tracking
+from rgbt.training.next_steps import next_steps
 
 if TYPE_CHECKING:  # they import torch, which takes seconds
     from torch import nn
@@ -186,13 +187,19 @@ def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
     tracking.refresh(folder, merged)
     warn_of_result(folder.path)
     _report_other_files(run, folder)
-    print_result(run, folder, tracking)
+    print_result(run, folder, tracking, is_point=bool(extra_tags))
 
 
-def print_result(run: RunSpec, folder: RunFolder, tracking: Tracking) -> None:
-    """Print the tables of a finished run, its folder and how its pages are opened."""
+def print_result(
+    run: RunSpec, folder: RunFolder, tracking: Tracking, *, is_point: bool = False
+) -> None:
+    """Print the tables of a finished run, its folder, and the commands that use it.
+
+    A point of a sweep, which nobody watches, gets its folder alone.
+    """
     heads = run.domains.heads_in_words(run.domains.tested_head)
-    links = [*([("heads", heads)] if heads else []), *tracking.links()]
+    steps = [] if is_point else next_steps(run, folder)
+    links = [*([("heads", heads)] if heads else []), *steps, *tracking.links()]
     print_rich(result_view(_tables_of(folder), folder.path, links))
 
 

@@ -109,7 +109,7 @@ def train_run(
     if upstream_of:
         print_upstream_result(folder, description.name)
     else:
-        print_result(spec, folder, tracking)
+        print_result(spec, folder, tracking, is_point=bool(extra_tags))
 
 
 class Training(Hooks):

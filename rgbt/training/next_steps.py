@@ -1,0 +1,87 @@
+"""What to do after a run: paths, and commands that work in the shell of the user as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.config.overrides import composing, words_of_run
+from rgbt.config.stored_config import checkouts, shipped_targets, targets
+from rgbt.runs.folder import GROUP, RunFolder, lists_of, read_description
+from rgbt.runs.naming import describe
+from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.specify import requested_run
+from rgbt.terminal import shell_command
+from rgbt.tracking.tracker import Link
+
+# The newest runs, among which one is sought to compare with.
+NEWEST = 20
+
+# Beginnings of the words that a run of another method has too, to be trained on the same images.
+SHARED = ("dataset", "scale", "recipe", "trainer.", "data.", "seed=", "runs_dir=", "tracking")
+SHARED += ("+debug=",)
+
+# The method to compare with, and that for the baseline itself.
+BASELINE, OTHER = "baseline", "crm"
+
+
+def next_steps(run: RunSpec, folder: RunFolder) -> list[Link]:
+    """Name the picture of test images, and commands to predict and to compare with another method.
+
+    Where no other run of these images is finished, the command that trains one.
+    """
+    steps, panel = [], folder.path / "figures" / "panel.png"
+    if panel.is_file():
+        steps.append(("look at", str(panel)))
+    words = [f"run={folder.path}", "input=test", "out=predicted", *_trust(run)]
+    steps.append(("predict", shell_command("predict", *words)))
+    steps.append(("", "your own images: input=FOLDER, with the folders rgb and thermal in it"))
+    if other := _other_run(run, folder):
+        words = [f"a={other}", f"b={folder.path.name}", f"runs_dir={folder.path.parent}"]
+        steps.append(("compare", shell_command("compare", *words)))
+    elif found := _other_method(run):
+        steps.append(("compare with", shell_command("run", *words_of_run(found))))
+    return steps
+
+
+def _trust(run: RunSpec) -> list[str]:
+    """Return the word that lets other commands execute the user's own classes; [] without any."""
+    own = set(targets(run.plain).values()) - shipped_targets()
+    modules = {name.rpartition(".")[0] for name in own}
+    folders = {str(Path(path).expanduser().resolve()) for path in checkouts(run.plain).values()}
+    return [f"trust={','.join(sorted(modules | folders))}"] if modules | folders else []
+
+
+def _other_run(run: RunSpec, folder: RunFolder) -> str:
+    """Return the key of the newest finished run of another method on the same images; "": none."""
+    own = describe(run)
+    results = folder.path.parent.glob("*/result.json")
+    for result in sorted(results, key=lambda path: -path.stat().st_mtime)[:NEWEST]:
+        try:
+            other = read_description(result.parent)
+        except InputError:  # a damaged run is none to compare with
+            continue
+        is_alike = other is not None and _images(other.params) == _images(own.params)
+        if other is not None and is_alike and other.tags.get(GROUP) != own.tags[GROUP]:
+            return result.parent.name
+    return ""
+
+
+def _images(params: dict[str, str]) -> tuple[object, ...]:
+    """Return what two runs that are compared share: the data set, and the lists of its splits."""
+    return {k: v for k, v in params.items() if k.startswith("dataset.")}, lists_of(params)
+
+
+def _other_method(run: RunSpec) -> Sequence[str]:
+    """Return the words of a run of another method on the same images; []: they do not compose."""
+    name = OTHER if run.name == BASELINE else BASELINE
+    typed = [word for word in run.overrides if word.startswith(SHARED)]
+    words = [f"+experiment={name}", *typed]
+    try:
+        with composing(words):
+            other = requested_run(compose(words), words)
+    except InputError:  # settings of a method that is no experiment of ours
+        return []
+    return words if _images(describe(other).params) == _images(describe(run).params) else []
