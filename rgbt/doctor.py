@@ -65,10 +65,8 @@ def main(options: Options, _: list[str]) -> int:
 def machine(_: Options) -> Lines:
     """Yield rgbt, Python, system, cores and memory, and which command the shell finds."""
     yield "rgbt", f"{rgbt.__version__} in {Path(rgbt.__file__).parent}"
-    yield (
-        "command",
-        shutil.which("rgbt") or "the shell does not find rgbt; activate the environment",
-    )
+    found = shutil.which("rgbt")
+    yield "command", found or "the shell does not find rgbt; activate the environment"
     yield "python", f"{platform.python_version()} ({sys.executable})"
     yield "system", f"{platform.platform()}, {usable_cores()} of {os.cpu_count()} cores usable"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB

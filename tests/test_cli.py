@@ -81,7 +81,7 @@ def test_help_of_run_lists_the_choices_that_hydra_finds(
 ) -> None:
     own = tmp_path / "experiment" / "mine.yaml"
     own.parent.mkdir()
-    own.write_text("_variants_: {one: {}, two: {}}\n")
+    own.write_text("name: mine\n_variants_: {one: {}, two: {}}\n")
     monkeypatch.setenv("RGBT_CONF", str(tmp_path))
     lines = " ".join(configuration_help(lambda config, words: None).split())
     for group in set(groups()) - {"hydra"}:

@@ -10,13 +10,17 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from rgbt.runs.folder import RunFolder
 from rgbt.terminal import shell_command
 from rgbt.training.next_steps import next_steps
 from sweeps.plan.planner import specify_run
+
+run_folder = partial(RunFolder, writes=False)
 
 SMOKE = ("+debug=smoke", "trainer.accelerator=cpu", "dataset.num_test=12")
 SCRIPT = Path(sys.executable).parent / "rgbt"
@@ -32,6 +36,7 @@ def test_command_is_short_where_the_shell_finds_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", f"{SCRIPT.parent}:/usr/bin")
+    monkeypatch.setenv("PWD", str(tmp_path))
     assert shell_command("ui", "runs_dir=my runs") == "rgbt ui 'runs_dir=my runs'"
     other = tmp_path / "rgbt"  # of another environment
     other.write_text("#!/bin/sh\n")
@@ -52,7 +57,7 @@ def test_command_is_a_path_where_the_shell_does_not(
     assert shell_command("ui") == "'my env/bin/python' -m rgbt ui"  # not installed
     (binaries / "rgbt").touch()
     assert shell_command("ui") == "'my env/bin/rgbt' ui"
-    monkeypatch.setenv("PWD", "/")
+    monkeypatch.setenv("PWD", "/nowhere")
     assert shell_command("ui") == shlex.join([str(binaries / "rgbt"), "ui"])
 
 
@@ -67,12 +72,6 @@ def test_other_method_has_the_words_of_the_same_images_alone() -> None:
     assert (
         "+experiment=crm" in dict(next_steps(baseline, run_folder(baseline.folder)))["compare with"]
     )
-
-
-def run_folder(path: Path):  # type: ignore[no-untyped-def]
-    from rgbt.runs.folder import RunFolder
-
-    return RunFolder(path, writes=False)
 
 
 @contextmanager
