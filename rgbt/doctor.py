@@ -28,8 +28,21 @@ from rgbt.files.atomic import check_writable
 GB, PROBLEM = 1e9, "problem"
 
 # Beginnings of the environment variables that change what rgbt does.
-VARIABLES = ("RGBT_", "MLFLOW_", "CUDA_", "NVIDIA_", "PYTORCH_", "OMP_", "MKL_", "GOMP_", "KMP_")
-VARIABLES += ("SLURM_JOB_ID", "XDG_CACHE_HOME", "TMPDIR", "PYTHONPATH", "VIRTUAL_ENV", "CONDA_PRE")
+VARIABLES = (
+    *(
+        "RGBT_",
+        "MLFLOW_",
+        "CUDA_",
+        "NVIDIA_",
+        "PYTORCH_",
+        "OMP_",
+        "MKL_",
+        "GOMP_",
+        "KMP_",
+        "TMPDIR",
+    ),
+    *("SLURM_JOB_ID", "XDG_CACHE_HOME", "PYTHONPATH", "VIRTUAL_ENV", "CONDA_PREFIX"),
+)
 
 # A line of our metadata: the name of a package, and the extra that needs it, if not all do.
 REQUIREMENT = re.compile(r"([\w.-]+)(?:.*extra == ['\"]([\w-]+))?")

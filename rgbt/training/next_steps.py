@@ -20,8 +20,10 @@ from rgbt.tracking.tracker import Link
 NEWEST = 20
 
 # Beginnings of the words that a run of another method has too, to be trained on the same images.
-SHARED = ("dataset", "scale", "recipe", "trainer.", "data.", "seed=", "runs_dir=", "tracking")
-SHARED += ("+debug=",)
+SHARED = (
+    *("dataset", "scale", "recipe", "trainer.", "data.", "seed=", "runs_dir=", "tracking"),
+    "+debug=",
+)
 
 # The method to compare with, and that for the baseline itself.
 BASELINE, OTHER = "baseline", "crm"

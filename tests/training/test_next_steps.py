@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 
 from rgbt.runs.folder import RunFolder
+from rgbt.runs.naming import describe
+from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import shell_command
 from rgbt.training.next_steps import next_steps
 from sweeps.plan.planner import specify_run
@@ -72,6 +74,31 @@ def test_other_method_has_the_words_of_the_same_images_alone() -> None:
     assert (
         "+experiment=crm" in dict(next_steps(baseline, run_folder(baseline.folder)))["compare with"]
     )
+
+
+def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Path) -> None:
+    def finished(*words: str) -> RunSpec:
+        run = specify_run((*words, f"runs_dir={tmp_path}"), checked=False)
+        run.folder.mkdir()
+        RunFolder(run.folder).describe(describe(run))
+        (run.folder / "result.json").touch()
+        return run
+
+    run = finished("+experiment=grbm")
+    finished("+experiment=grbm", "seed=1")
+    finished("+experiment=baseline", "dataset.num_test=12")
+    finished("+experiment=baseline", "dataset.splits.train=val", "dataset=mfnet", "dataset.root=x")
+    assert "compare" not in dict(next_steps(run, run_folder(run.folder)))
+    other = finished("+experiment=crm")
+    command = dict(next_steps(run, run_folder(run.folder)))["compare"]
+    expected = [f"a={other.key}", f"b={run.key}", f"runs_dir={tmp_path}"]
+    assert shlex.split(command)[-3:] == expected
+
+
+def test_own_classes_are_trusted_by_the_printed_command(tmp_path: Path) -> None:
+    run = specify_run(("+experiment=grbm", f"runs_dir={tmp_path}"), checked=False)
+    run.plain["masker"]["_target_"] = "my_lab.maskers.Mine"
+    assert dict(next_steps(run, run_folder(run.folder)))["predict"].endswith("trust=my_lab.maskers")
 
 
 @contextmanager
