@@ -1,11 +1,11 @@
-"""CPU seconds that a command takes beside training: help, configuration, first step, finished run.
+"""CPU seconds that a command takes beside training: help, configuration, first step, evaluation.
 
 Each command is a process of its own, with an MLflow store in SQLite that exists; user and system
 time of it and of its children. The floor of a training is measured beside it: the import of torch,
 and of what an optimizer of torch and Fabric import. Another checkout of this repository can be
 measured in turns with this one.
 
-Run: python -m tests.benchmarks.bench_start [folder of another checkout ...]
+Run: python -m tests.benchmarks.bench_start [folder of another checkout ...] [case=--help,...]
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 
 ROUNDS = 3
 RUN = ("-m", "rgbt.run")
-SMOKE = ("+experiment=grbm", "+debug=smoke")
+SMOKE = ("+experiment=grbm", "+debug=smoke", "dataset.num_test=100")
 
 UNTIL_FIRST_STEP = """
 import os, sys
@@ -48,11 +48,18 @@ def smoke(runs: Path, *more: str) -> tuple[str, ...]:
     return (*SMOKE, f"runs_dir={runs}", *more)
 
 
+def evaluate(runs: Path) -> tuple[str, ...]:
+    """Of the 100 test images of the first run, not yet evaluated into this folder."""
+    run = next(runs.glob("*/result.json")).parent
+    return ("-m", "rgbt.evaluate", f"run={run}", f"out={runs / 'evaluated' / 'counts.npz'}")
+
+
 CASES: dict[str, Case] = {
     "--help": lambda _: (*RUN, "--help"),
     "--cfg job": lambda _: (*RUN, "--cfg", "job", "+experiment=grbm"),
     "finished run": lambda runs: (*RUN, *smoke(runs)),
     "until the first step": lambda runs: ("-c", UNTIL_FIRST_STEP, *smoke(runs, "seed=1")),
+    "evaluate 100 images": evaluate,
     "whole smoke run": lambda runs: (*RUN, *smoke(runs, "seed=2")),
     "import torch": lambda _: ("-c", "import torch"),
     "torch, Fabric, optimizer": lambda _: ("-c", OPTIMIZER),
@@ -75,14 +82,15 @@ def cpu_seconds(words: tuple[str, ...], checkout: Path) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def measure(checkouts: list[Path], folder: Path) -> dict[str, list[float]]:
+def measure(checkouts: list[Path], folder: Path, names: list[str]) -> dict[str, list[float]]:
     """Case -> the median of each checkout; the checkouts take turns."""
     stores = [folder / str(number) for number in range(len(checkouts))]
     for checkout, runs in zip(checkouts, stores, strict=True):
         cpu_seconds(CASES["finished run"](runs), checkout)  # trains the run and makes the store
         cpu_seconds(CASES["finished run"](runs), checkout)
     found: dict[str, list[float]] = {}
-    for name, case in CASES.items():
+    for name in names:
+        case = CASES[name]
         times: list[list[float]] = [[] for _ in checkouts]
         for _ in range(ROUNDS):
             for each, checkout, runs in zip(times, checkouts, stores, strict=True):
@@ -95,14 +103,13 @@ def measure(checkouts: list[Path], folder: Path) -> dict[str, list[float]]:
 
 
 def main() -> None:
-    checkouts = [Path.cwd(), *(Path(word).resolve() for word in sys.argv[1:])]
+    chosen = [word[5:].split(",") for word in sys.argv[1:] if word.startswith("case=")]
+    others = [Path(word).resolve() for word in sys.argv[1:] if not word.startswith("case=")]
     with TemporaryDirectory() as folder:
-        found = measure(checkouts, Path(folder))
-    print(
-        f"{'CPU s':<26} {'this':>8} " + " ".join(f"{'other':>8} {'ratio':>6}" for _ in sys.argv[1:])
-    )
-    for name, (own, *others) in found.items():
-        print(f"{name:<26} {own:8.2f} " + " ".join(f"{o:8.2f} {o / own:6.2f}" for o in others))
+        found = measure([Path.cwd(), *others], Path(folder), chosen[0] if chosen else [*CASES])
+    print(f"{'CPU s':<26} {'this':>8} " + " ".join(f"{'other':>8} {'ratio':>6}" for _ in others))
+    for name, (own, *rest) in found.items():
+        print(f"{name:<26} {own:8.2f} " + " ".join(f"{o:8.2f} {o / own:6.2f}" for o in rest))
 
 
 if __name__ == "__main__":
