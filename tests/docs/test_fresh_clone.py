@@ -51,7 +51,7 @@ def variables(tmp_path: Path, clone: Path) -> dict[str, str]:
     for path in Path(sysconfig.get_path("purelib")).iterdir():
         if not OURS.match(path.name):
             (dependencies / path.name).symlink_to(path)
-    venv.create(clone / ".venv", symlinks=True, with_pip=True)
+    venv.create(clone / ".venv", symlinks=True)  # make adds pip
     (site,) = (clone / ".venv" / "lib").glob("python*/site-packages")
     (site / "dependencies.pth").write_text(f"{dependencies}\n")
     kept = {name: value for name, value in os.environ.items() if name not in HIDDEN}
