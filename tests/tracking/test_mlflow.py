@@ -89,7 +89,8 @@ def run_of(runs_dir: Path, folder: RunFolder) -> Any:
 
 
 def points(store: Any, run_id: str, name: str) -> list[tuple[int, float]]:
-    return [(point.step, point.value) for point in store.get_metric_history(run_id, name)]
+    history = store.get_metric_history(run_id, name)
+    return [(point.step, point.value) for point in history if not math.isnan(point.value)]
 
 
 LINES = (
