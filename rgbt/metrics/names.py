@@ -65,8 +65,8 @@ def in_percent(name: str, value: float) -> float:
 def shown(values: Mapping[str, float]) -> dict[str, float]:
     """Turn scores into percent with two decimals, as papers print them and MLflow shows them.
 
-    Its charts write 0.62 for a fraction, and its tables all sixteen digits. A region is named as in
-    the papers, "IoU1": it heads a column, and sorts first where MLflow's scatter plot takes an axis.
+    Its charts write 0.62 for a fraction, and its tables all sixteen digits. A region is named as
+    the papers do, "IoU1": it heads a column, and sorts first, as its scatter plot takes its axis.
     """
     scores = {n for n in values if _is_fraction(n) or n.split("/")[-1] == VAR}
     found = {n: round(in_percent(n, v), 2) if n in scores else v for n, v in values.items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import shutil
 import sqlite3
 import tempfile
@@ -100,7 +99,8 @@ class ExperimentClient:
                 self.set_experiment_tag(self.experiment_id, name, value)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        call, limit_s = getattr(self._client, name), FILE_S if re.search("artifact|image", name) else self._limit_s
+        is_file = "artifact" in name or name == "log_image"
+        call, limit_s = getattr(self._client, name), FILE_S if is_file else self._limit_s
         return lambda *values, **named: _within(limit_s, call, *values, **named)
 
     def check_files(self, artifact_uri: str) -> None:

@@ -152,11 +152,7 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
     write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
     for file in _own_files(folder):
         if file.stat().st_ctime > state.sent:
-            parent = file.parent.relative_to(path).as_posix()
-            store.log_artifact(state.run_id, str(file), None if parent == "." else parent)
-            if file.stem in IMAGES:
-                with Image.open(file) as image:
-                    store.log_image(state.run_id, image, key=file.stem, step=0)
+            _send_file(store, state.run_id, file, file.parent.relative_to(path).as_posix())
     if tables is not None and (path / "tables.json").stat().st_ctime > state.sent:
         store.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
     store.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
@@ -166,6 +162,13 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
         store.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
     state.sent = began
     write_upload_state(folder, state)
+
+
+def _send_file(store: ExperimentClient, run_id: str, file: Path, parent: str) -> None:
+    store.log_artifact(run_id, str(file), None if parent == "." else parent)
+    if file.stem in IMAGES:
+        with Image.open(file) as image:
+            store.log_image(run_id, image, key=file.stem, step=0)
 
 
 def _run_of(

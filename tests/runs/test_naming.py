@@ -43,7 +43,8 @@ def test_name_and_group(
 
 
 def test_what_a_search_varies_is_named_first_with_three_digits() -> None:
-    drawn = ("masker.sigma_div=1.2227708767423853", "masker.patch_size=8", "loss.spatial.alpha=1.1111")
+    sigma = "masker.sigma_div=1.2227708767423853"
+    drawn = (sigma, "masker.patch_size=8", "loss.spatial.alpha=1.1111")
     keys = " ".join(word.partition("=")[0] for word in drawn)
     spec = replace(specified(("+experiment=grbm",)), overrides=("seed=0", STEPS, *drawn))
     found = describe(spec, {VARIED: keys})
