@@ -114,7 +114,7 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     folders = [stored.path for stored in runs_in(root)] if root.is_dir() else []
     paths = [*filter(is_finished, folders), *archived(Path(archive))]
     # It takes a minute to unpack an archive of some hundred runs.
-    for path in tracked(paths, f"reading runs of {root} and {archive}", len(paths)):
+    for path in tracked(paths, "reading runs", len(paths)):
         try:
             run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read

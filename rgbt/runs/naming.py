@@ -26,6 +26,9 @@ VARIED = "rgbt.varied"
 # Characters of a value in a name; a longer one, such as a path, is cut in the middle.
 VALUE_LENGTH = 32
 
+# What a setting without a group may have, which says nothing without its key.
+VALUES = ("null", "true", "false", "auto", "none")
+
 # Short words for settings, as the papers write them; others are named by the end of their key.
 SYMBOLS = {"masker.sigma_div": "σ", "masker.patch_size": "patch", "loss.spatial.alpha": "α"}
 
@@ -50,9 +53,9 @@ EXTRA_MEASUREMENTS = ("tracking.", "consistency")
 def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Description:
     """Name, tags and parameters of a run.
 
-    Only what was typed beside the experiment is named, and is a parameter: MLflow lists every
-    parameter of the runs that it compares, and config.yaml has all. Of a point of a sweep, what is
-    common to all points follows the experiment: "σ 2 · s1 · grbm · max_steps 9".
+    Only what was typed beside the experiment is named. Of a point of a sweep, what is common to all
+    points follows the experiment: "σ 2 · s1 · grbm · max_steps 9", and is no parameter: MLflow
+    lists every parameter of the runs that it compares, and draws the first one.
 
     Args:
         spec: the run.
@@ -73,12 +76,13 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
     }
     # What varies, and what does not; outside of a sweep everything may vary.
     varied = tags.get(VARIED, "").split()
-    first = [short_word(word) for key, word in words.items() if key in varied or not varied]
-    rest = [short_word(word) for key, word in words.items() if varied and key not in varied]
+    chosen = {key: word for key, word in words.items() if key in varied or not varied}
+    first = [short_word(word) for word in chosen.values()]
+    rest = [short_word(word) for key, word in words.items() if key not in chosen]
     seed = f"s{spec.seed}"
     is_method = "experiment" in varied or not first  # the method is what tells the run apart
     named = [spec.name, *first, seed] if is_method else [*first, seed, spec.name]
-    values = {key: word.partition("=")[2] for key, word in words.items() if "=" in word}
+    values = {key: word.partition("=")[2] for key, word in chosen.items() if "=" in word}
     params = {**values, "name": spec.name, "seed": str(spec.seed)}
     command = [
         word for word in spec.overrides if not word.lstrip("+").startswith(MACHINE_OVERRIDES)
@@ -102,8 +106,8 @@ def tags_from_environment() -> dict[str, str]:
 def short_word(word: str) -> str:
     """Return an override as people read it: "masker.sigma_div=1.2227" as "σ 1.22".
 
-    Numbers have three significant digits. A long text is cut in its middle, which a digest
-    identifies.
+    Of a file of a group, "masker=crm", only its name is read. Numbers have three significant
+    digits. A long text is cut in its middle, which a digest identifies.
     """
     key, equals, value = word.lstrip("+").partition("=")
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
@@ -115,4 +119,7 @@ def short_word(word: str) -> str:
     elif not value.lstrip("-").isdecimal():
         with suppress(ValueError):
             value = f"{float(value):.3g}"
-    return f"{SYMBOLS.get(key, key.rpartition('.')[2])} {value}" if equals else key
+    is_choice = value.isidentifier() and "." not in key and value not in VALUES
+    if is_choice or not equals:
+        return value or key
+    return f"{SYMBOLS.get(key, key.rpartition('.')[2])} {value}"
