@@ -75,7 +75,11 @@ bench: $(VENV)/.ready
 gpu-check: $(READY)
 	$(BIN)/python -m tests.benchmarks.gpu_check $(if $(RELEASE),release=$(RELEASE)) $(WORDS)
 
+# A terminal shows pip's bars; a log, what was installed and how long it took.
 $(VENV)/.ready: pyproject.toml constraints.txt
+	@echo "Installing rgbt and its tools into $(VENV): two to ten minutes, about 3 GB; once."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@begin=$$(date +%s); if [ -t 1 ]; then quiet=; else quiet=--quiet; fi; \
+	  $(BIN)/python -m pip install $$quiet --disable-pip-version-check -c constraints.txt -e ".[dev]" \
+	  && echo "Installed in $$(( $$(date +%s) - begin )) s, $$(du -sh $(VENV) | cut -f1)."
 	touch $@
