@@ -26,7 +26,10 @@ TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt swee
 # Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
 MARKED := README.md,docs/results/findings.md,docs/results/spatial-bias.md
 
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# A terminal shows pip's bars; a log, what was installed and how long it took.
+INSTALL = begin=$$(date +%s); if [ -t 1 ]; then quiet=; else quiet=--quiet; fi; \
+	$(BIN)/python -m pip install $$quiet --disable-pip-version-check -c constraints.txt
+INSTALLED = echo "Installed in $$(( $$(date +%s) - begin )) s, $$(du -sh $(VENV) | cut -f1)."
 
 # gpu-check with BIN=/some/env/bin uses that environment, and installs nothing.
 READY := $(if $(filter command line,$(origin BIN)),,$(VENV)/.ready)
@@ -79,11 +82,13 @@ gpu-check: $(READY)
 
 # What a user needs; `.ready` has the tools of the tests and the pages on top.
 $(VENV)/.installed: pyproject.toml constraints.txt
+	@echo "Installing rgbt into $(VENV): two to ten minutes, about 2 GB; once."
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) -e .
+	@$(INSTALL) -e . && $(INSTALLED)
 	touch $@
 
 $(VENV)/.ready: pyproject.toml constraints.txt
+	@echo "Installing rgbt and its tools into $(VENV): two to ten minutes, about 3 GB; once."
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) -e ".[dev]"
+	@$(INSTALL) -e ".[dev]" && $(INSTALLED)
 	touch $(VENV)/.installed $@

@@ -19,9 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
-from rich.progress import track
-
 from analysis.commands import Archive
 from analysis.packing import (
     SHARED,
@@ -42,7 +39,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder, find_run, is_finished, read_result, runs_in
 from rgbt.runs.result import RunResult, check_result
 from rgbt.tables import TextTable
-from rgbt.terminal import plain_text, print_rich, rich_table, warn
+from rgbt.terminal import plain_text, print_rich, rich_table, tracked, warn
 
 if TYPE_CHECKING:
     from rgbt.runs.run_spec import RunSpec
@@ -184,7 +181,8 @@ Compared = tuple[Path, str, str, "RunSpec | None"]
 
 
 def _compared(archive: Path) -> Iterator[Compared]:
-    for path in track(archived(archive), "runs", console=Console(stderr=True), transient=True):
+    paths = archived(archive)
+    for path in tracked(paths, "runs", len(paths)):
         try:
             with tempfile.TemporaryDirectory() as scratch, undamaged(path):
                 yield _compare(path, unpack(path, Path(scratch)))

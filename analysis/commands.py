@@ -1,17 +1,14 @@
-"""What the commands of the analysis have in common: options, progress, tables and files."""
+"""What the commands of the analysis have in common: options, tables and files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from annotated_types import Interval
-from rich.console import Console
-from rich.progress import Progress
 
 from rgbt.checks import InputError
 from rgbt.config.options import Help
@@ -85,14 +82,6 @@ def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
         )
     dataset: LabelledDataset = built("dataset", overrides)
     return dataset
-
-
-@contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a bar on stderr; yields a function to call after each of `total` steps."""
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda: bar.advance(task)
 
 
 def in_threads(work: Callable[..., T], *arguments: Iterable[Any]) -> Iterator[T]:

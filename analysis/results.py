@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from analysis.archive import archived, unpack
 from rgbt.checks import InputError, nearest, split_list
@@ -29,7 +27,7 @@ from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, tally, variance
 from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
 from rgbt.runs.result import COUNTS, RunResult
-from rgbt.terminal import info, warn
+from rgbt.terminal import info, tracked, warn
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,10 +113,8 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
     folders = [stored.path for stored in runs_in(root)] if root.is_dir() else []
     paths = [*filter(is_finished, folders), *archived(Path(archive))]
-    what, console = f"reading runs of {root} and {archive}", Console(stderr=True)
-    is_hidden = not console.is_terminal
     # It takes a minute to unpack an archive of some hundred runs.
-    for path in track(paths, what, console=console, transient=True, disable=is_hidden):
+    for path in tracked(paths, "reading runs", len(paths)):
         try:
             run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read

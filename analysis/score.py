@@ -17,7 +17,6 @@ from analysis.commands import (
     Regions,
     check_out,
     dataset_of,
-    progress,
     text_table,
     write_files,
 )
@@ -28,6 +27,7 @@ from rgbt.config.overrides import built
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent
+from rgbt.terminal import counting
 
 if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
     import pandas as pd
@@ -135,7 +135,7 @@ def main(options: ScoreOptions, overrides: list[str]) -> int:
         if out is not None:
             scored.save(out)
     frames, tables, protocols, other_tables = [], [], {}, []
-    with progress("scoring", len(counted)) as advance:
+    with counting("scoring", len(counted)) as advance:
         for name, counts, own in counted:
             frame = scores(name, counts)
             said = add_intervals(frame, counts, settings) if settings else ""
@@ -284,7 +284,7 @@ def _scored(options: ScoreOptions, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import score_folder
 
     dataset, split = dataset_of(overrides), options.split or "test"
-    with progress("counting", len(dataset.names(split))) as advance:
+    with counting("counting", len(dataset.names(split))) as advance:
         return score_folder(
             Path(options.predictions),
             dataset,

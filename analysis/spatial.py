@@ -17,7 +17,6 @@ from analysis.commands import (
     Resamples,
     check_out,
     dataset_of,
-    progress,
     write_files,
 )
 from rgbt.config.options import Help
@@ -79,7 +78,7 @@ def main(options: SpatialOptions, overrides: list[str]) -> int:
     from analysis.statistics.resampled import ResampledSplit, no_background, quantities
     from analysis.statistics.statements import judged
     from rgbt.metrics import metric
-    from rgbt.terminal import plain_text, print_rich, rich_table
+    from rgbt.terminal import counting, plain_text, print_rich, rich_table
 
     out, way = options.out, (options.estimator, options.average)
     check_out(out)
@@ -91,7 +90,7 @@ def main(options: SpatialOptions, overrides: list[str]) -> int:
         absent="released",
     )
     dataset = dataset_of(overrides)
-    with progress("measuring", len(dataset.names(options.split))) as advance:
+    with counting("measuring", len(dataset.names(options.split))) as advance:
         stats = collect(
             dataset,
             options.split,

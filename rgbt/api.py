@@ -50,7 +50,7 @@ class Run(RunResult):
 
     @property
     def name(self) -> str:
-        """Return the name as in MLflow, for example "sigma_div=2 seed=1 · grbm"."""
+        """Return the name as in MLflow, for example "σ 2 · s1 · grbm"."""
         return self.description.name
 
     @property

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import inspect
+import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # --help does not wait for torch
     from torch import Tensor
@@ -18,6 +20,22 @@ class InputError(ValueError):
 
 class RunError(RuntimeError):
     """A run that cannot continue (a loss that is not finite): a message, exit code 1."""
+
+
+def of_posix(name: str, purpose: str) -> Any:
+    """Return a module or function that POSIX systems alone have, such as "fcntl" or "os.fork".
+
+    InputError: this system has none; `purpose` says what needs it.
+    """
+    module, _, member = name.partition(".")
+    try:
+        found = importlib.import_module(module)
+        return getattr(found, member) if member else found
+    except (ImportError, AttributeError):
+        system = platform.system()
+        raise InputError(
+            f"{purpose} needs {name}, which {system} does not have; use Linux, macOS or WSL."
+        ) from None
 
 
 def without_controls(text: str) -> str:

@@ -80,10 +80,8 @@ def main(options: Options, overrides: list[str]) -> int:
 
 def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
     """Judge the claims of the requested tables by the finished runs."""
-    from rich.console import Console
-    from rich.progress import track
-
     from analysis.results import finished_runs
+    from rgbt.terminal import tracked
     from sweeps.judge.judged_table import JudgedTable, Resamplers
     from sweeps.judge.stored_tables import runs_of_request
     from sweeps.plan.planner import Planner
@@ -99,7 +97,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedTable]:
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedTable] = []
     resamplers: Resamplers = {}
-    for name in track(names, "judging", console=Console(stderr=True), transient=True):
+    for name in tracked(names, "judging", len(names)):
         if not load_table(name).claims:
             continue
         request = make_request(

@@ -13,7 +13,7 @@ import pandas as pd
 from annotated_types import Interval
 from matplotlib.figure import Figure
 
-from analysis.commands import MOST, dataset_of, progress
+from analysis.commands import MOST, dataset_of
 from analysis.results import Frames, Levels, open_counts, trainings
 from analysis.statistics.collect import SpatialStatistics, collect
 from analysis.uncertainty.same_images import in_order
@@ -23,7 +23,7 @@ from rgbt.config.options import Help
 from rgbt.config.overrides import built
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.terminal import warn
+from rgbt.terminal import counting, warn
 
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
@@ -169,7 +169,7 @@ class StatisticsOptions:
             )
         if not self.statistics:
             split = self.split or "train"
-            with progress("measuring", len(config.dataset.names(split))) as advance:
+            with counting("measuring", len(config.dataset.names(split))) as advance:
                 return collect(config.dataset, split, config.regions, advance=advance)
         path = file_in(self.statistics, "statistics.npz")
         stored = SpatialStatistics.load(path)

@@ -19,8 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import track
 
 from rgbt.checks import InputError
 from rgbt.config.command import command
@@ -33,7 +31,7 @@ from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
 from rgbt.geometry.alignment import GRID, estimated, grid_of, moved, root_mean_square
 from rgbt.geometry.optical_flow import gray_of
 from rgbt.tables import TextTable
-from rgbt.terminal import plain_text, print_rich, rich_table
+from rgbt.terminal import plain_text, print_rich, rich_table, tracked
 
 # Name of a sample, or "" for the whole data set, and a sentence about it.
 Sentences = list[tuple[str, str]]
@@ -287,10 +285,9 @@ def _read(
         except InputError as error:
             return str(error)
 
-    console = Console(stderr=True)
     with ThreadPoolExecutor(num_threads) as pool:
         results = pool.map(read, names)
-        yield from track(results, "reading", len(names), console=console, disable=not is_shown)
+        yield from tracked(results, "reading", len(names)) if is_shown else results
 
 
 def _content_of(dataset: FileDataset, name: str) -> Content:

@@ -14,6 +14,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any, Protocol, cast
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from rgbt.checks import InputError, RunError, without_controls
+from rgbt.checks import InputError, RunError, of_posix, without_controls
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
 from rgbt.data.rare_classes import RareClasses, crop_showing
 from rgbt.dataset import LabelledDataset
@@ -40,7 +41,7 @@ EVAL_ADVICE = "; set data.eval_batch_size=1"
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
 # Signals that end a command (`rgbt.runtime.signals`).
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
 
 # Interval at which a worker checks that its main process exists.
 LOOK_S = 2.0
@@ -195,6 +196,20 @@ class BatchReader(Dataset[LoadedBatch]):
         return LoadedBatch(batch, skipped)
 
 
+@contextmanager
+def _blocked(num_workers: int) -> Iterator[None]:
+    """Block signals in all threads of the new workers: some libraries start some when forked."""
+    if not num_workers:
+        yield
+        return
+    change = of_posix("signal.pthread_sigmask", f"data.num_workers={num_workers}")
+    before = change(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        change(signal.SIG_SETMASK, before)
+
+
 class Batches(Iterator[Batch]):
     """Loads batches in order, one by `reader` for every list of `keys`.
 
@@ -206,26 +221,21 @@ class Batches(Iterator[Batch]):
         self, reader: BatchReader, *, keys: Iterable[list[Any]], settings: LoaderSettings
     ) -> None:
         self.skipped: dict[str, str] = {}
-        # Blocked in all threads of the new processes: some libraries start some when forked.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
-        try:
-            with warnings.catch_warnings():
-                # More workers than cores wait for each other; nothing else is wrong with them.
-                warnings.filterwarnings("ignore", "This DataLoader will create")
-                loader = DataLoader(
-                    reader,
-                    sampler=keys,
-                    batch_size=None,  # a key is a whole batch
-                    num_workers=settings.num_workers,
-                    prefetch_factor=settings.prefetch if settings.num_workers else None,
-                    worker_init_fn=start_worker,
-                    pin_memory=torch.cuda.is_available(),
-                    # Without it the loader draws the seed of its workers from the global generator.
-                    generator=torch.Generator(),
-                )
-                self._loaded = cast(Iterator[LoadedBatch], iter(loader))
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with _blocked(settings.num_workers), warnings.catch_warnings():
+            # More workers than cores wait for each other; nothing else is wrong with them.
+            warnings.filterwarnings("ignore", "This DataLoader will create")
+            loader = DataLoader(
+                reader,
+                sampler=keys,
+                batch_size=None,  # a key is a whole batch
+                num_workers=settings.num_workers,
+                prefetch_factor=settings.prefetch if settings.num_workers else None,
+                worker_init_fn=start_worker,
+                pin_memory=torch.cuda.is_available(),
+                # Without it the loader draws the seed of its workers from the global generator.
+                generator=torch.Generator(),
+            )
+            self._loaded = cast(Iterator[LoadedBatch], iter(loader))
 
     def __next__(self) -> Batch:
         """Return the next batch that holds at least one sample.

@@ -1,4 +1,4 @@
-"""The progress bar of a command: what was done, speed and remaining time in one line.
+"""The lines of a training in a log: what was done, speed and remaining time.
 
 A training that becomes much slower says so.
 """
@@ -14,47 +14,15 @@ from collections.abc import Callable, Mapping
 from datetime import timedelta
 from statistics import fmean, median
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
 from rgbt.checks import without_controls
 from rgbt.cores import usable_cores
-from rgbt.terminal import warn
+from rgbt.terminal import CONSOLE, PAUSE_S, warn
 
 # A training is slow when its last steps take so many times as long as its first ones.
 SLOWER, NUM_FIRST, NUM_LAST = 10, 100, 10
 
-# Lines of a training that are written without a pause, and seconds between two later ones.
-NUM_AT_ONCE, PAUSE_S = 10, 10.0
-
-# Progress goes to stderr; stdout is for results.
-CONSOLE = Console(stderr=True)
-
-
-def progress() -> Progress:
-    """Make a progress display with columns for count, time left and a note (task field `note`)."""
-    # Drawing ten times a second takes 2 % of a core. In a file it would be one long line.
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description:<10}", markup=False),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-        console=CONSOLE,
-        refresh_per_second=4,
-        disable=not CONSOLE.is_terminal,
-    )
+# Lines of a training that are written without a pause; later ones come every `PAUSE_S` seconds.
+NUM_AT_ONCE = 10
 
 
 def training_log(total: int) -> Callable[[int, Mapping[str, float]], None]:

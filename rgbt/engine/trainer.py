@@ -7,7 +7,7 @@ adds to its steps are the methods of one object, `Hooks`.
 from __future__ import annotations
 
 import math
-import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +19,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import InputError, RunError, of_posix
 from rgbt.engine.batch_norm import share_running_statistics
 from rgbt.engine.checkpoint import (
     ADVICE,
@@ -40,7 +40,7 @@ from rgbt.engine.checkpoint import (
 from rgbt.engine.device import compiles_functions
 from rgbt.engine.host_copy import Copies, copied, reserve
 from rgbt.engine.optimizers import step_without_gradient
-from rgbt.engine.progress import progress, training_log, watch_pace, write_evaluation
+from rgbt.engine.progress import training_log, watch_pace, write_evaluation
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.fusion import compile_fused
@@ -54,6 +54,7 @@ from rgbt.processes import (
 )
 from rgbt.randomness import generators_of_step
 from rgbt.runtime.signals import Stopped, at_once, deferred, ending_command, noted, raise_noted
+from rgbt.terminal import progress
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
 StepData = Batch | TwoDomains
@@ -211,7 +212,9 @@ class Trainer:
             raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
         elapsed = time.perf_counter() - started
         self.note_pace(elapsed, waited)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+        resource = of_posix("resource", "the peak memory of a training")
+        unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes; KiB
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
         if device.type == "cuda":
             peak = torch.cuda.max_memory_allocated(device) / 2**20
         images = num_processes() * sum(len(batch.name) for batch in loaded)

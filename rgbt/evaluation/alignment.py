@@ -18,7 +18,6 @@ from rgbt.data.files import read_bytes
 from rgbt.data.folder import Folder
 from rgbt.data.images import grey
 from rgbt.data.thermal import kind_of
-from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
@@ -37,7 +36,7 @@ from rgbt.geometry.optical_flow import gray_of
 from rgbt.geometry.rig import CALIBRATION, Rig, maps_of, of_calibration, of_homography, resampled
 from rgbt.metrics.metric import Regions
 from rgbt.tables import TextTable, number, without_nan
-from rgbt.terminal import path_lines, plain_text, print_rich, rich_table, warn
+from rgbt.terminal import path_lines, plain_text, print_rich, progress, rich_table, warn
 from rgbt.types import IGNORE
 
 Side = Literal["rgb", "thermal"]

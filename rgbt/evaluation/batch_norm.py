@@ -21,9 +21,9 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.progress import progress
 from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.measurement import Measurement
+from rgbt.terminal import progress
 
 Names = tuple[str, ...]
 

@@ -16,7 +16,6 @@ from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
 from rgbt.data.loaders import collate
 from rgbt.data.new_images import ToPredict, of_split
-from rgbt.engine.progress import progress
 from rgbt.evaluation.predict import Predictor
 from rgbt.exported.onnx_network import (
     ExportedNetwork,
@@ -27,6 +26,7 @@ from rgbt.exported.onnx_network import (
 )
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import NetworkRecord, record_of
+from rgbt.terminal import progress
 
 NO_TRACKING = "rgbt.tracking.tracker.Tracking"
 

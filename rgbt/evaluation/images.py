@@ -33,13 +33,12 @@ from rgbt.data.pseudo_labels import (
     confidence_path,
     label_path,
 )
-from rgbt.engine.progress import progress
 from rgbt.evaluation.predict import Predictor
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import inside, write_json
 from rgbt.metrics.measurement import Measurement
 from rgbt.tables import TextTable, percent
-from rgbt.terminal import info
+from rgbt.terminal import info, progress
 from rgbt.tracking.pictures import overlay
 from rgbt.types import IGNORE, Batch, Sample
 

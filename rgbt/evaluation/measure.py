@@ -22,7 +22,6 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import KnownScenes, LabelledDataset, reader_of
 from rgbt.engine.memory import naming_memory
-from rgbt.engine.progress import progress
 from rgbt.evaluation.batch_norm import normalised, parts_of_split
 from rgbt.evaluation.corruption import CorruptedDataset
 from rgbt.evaluation.predict import Predictor, view_of
@@ -32,7 +31,7 @@ from rgbt.metrics.details import SCENE_KINDS, DetailKind, Details
 from rgbt.metrics.measurement import Measurement, Statistics, settings_of
 from rgbt.metrics.scores import extremes
 from rgbt.processes import collected, num_processes
-from rgbt.terminal import info
+from rgbt.terminal import info, progress
 from rgbt.tracking.pictures import write_strip
 from rgbt.transforms.maps import nearest
 from rgbt.types import Batch, Sample, View

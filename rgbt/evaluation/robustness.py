@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rgbt.assembly.session import Session
 from rgbt.config.corruption_node import ChosenCorruption
-from rgbt.engine.progress import progress
 from rgbt.evaluation.corruption import corrupted, corruption_of
 from rgbt.evaluation.measure import files_of, measure, measurement_of, store, stored
 from rgbt.evaluation.predict import view_of
@@ -18,6 +17,7 @@ from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.scores import summary
 from rgbt.requirements import NetworkRecord, record_of
 from rgbt.tables import TextTable, csv_text, percent
+from rgbt.terminal import progress
 from rgbt.types import View
 
 # Inputs of a network for both images, of which it decodes one branch alone.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
+import platform
 import re
 import shutil
 import tempfile
@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, of_posix
 
 # Seconds between two attempts to take a lock.
 POLL_S = 0.1
@@ -69,6 +69,8 @@ def replacing(path: Path, size: Callable[[], int] | None = None) -> Iterator[Bin
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+    if os.name == "nt":  # Windows opens no folder
+        return
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -127,16 +129,17 @@ def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
     Yields:
         None while the lock is held by us; otherwise who holds it ("process 12 on host").
     """
+    lock = of_posix("fcntl", f"the lock {path}")
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     _held.add(descriptor)
     deadline = time.monotonic() + wait_s
     try:
         # Polled: a wait inside flock has no limit, and a stopped process never lets go.
-        while not (is_ours := _take(descriptor, fcntl.LOCK_EX)) and time.monotonic() < deadline:
+        while not (is_ours := _take(descriptor, lock.LOCK_EX)) and time.monotonic() < deadline:
             time.sleep(POLL_S)
         if is_ours:
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}".encode(), 0)
             yield None
         else:
             yield os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
@@ -150,10 +153,12 @@ def is_held(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open() as file:  # shared: two that ask at once take no other for a holder
-        return not _take(file.fileno(), fcntl.LOCK_SH)
+        return not _take(file.fileno(), of_posix("fcntl", f"the lock {path}").LOCK_SH)
 
 
 def _take(descriptor: int, kind: int) -> bool:
+    import fcntl
+
     try:
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -169,4 +174,5 @@ def _close_in_child() -> None:
     _held.clear()
 
 
-os.register_at_fork(after_in_child=_close_in_child)
+if hasattr(os, "register_at_fork"):  # POSIX
+    os.register_at_fork(after_in_child=_close_in_child)

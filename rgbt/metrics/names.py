@@ -6,6 +6,7 @@ ECE 0 is best.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 MIOU = "mIoU"  # mean over scored classes, pixels of the whole image pooled (no mean of regions)
@@ -64,10 +65,12 @@ def in_percent(name: str, value: float) -> float:
 def shown(values: Mapping[str, float]) -> dict[str, float]:
     """Turn scores into percent with two decimals, as papers print them and MLflow shows them.
 
-    Its charts write 0.62 for a fraction, and its tables all sixteen digits.
+    Its charts write 0.62 for a fraction, and its tables all sixteen digits. A region is named as
+    the papers do, "IoU1": it heads a column, and sorts first, as its scatter plot takes its axis.
     """
     scores = {n for n in values if _is_fraction(n) or n.split("/")[-1] == VAR}
-    return {n: round(in_percent(n, v), 2) if n in scores else v for n, v in values.items()}
+    found = {n: round(in_percent(n, v), 2) if n in scores else v for n, v in values.items()}
+    return {re.sub(r"^region/(\d+)$", r"IoU\1", name): v for name, v in found.items()}
 
 
 def _is_fraction(name: str) -> bool:

@@ -1,7 +1,7 @@
-"""Names and groups of runs: "masker.sigma_div=2 seed=1 · grbm", in "grbm masker.sigma_div=2".
+"""Names and groups of runs: "σ 2 · s1 · grbm", in the group "grbm masker.sigma_div=2".
 
 The group is a tag that all seeds of one configuration share; users type it in commands. The name is
-for people: settings that vary come first, then the experiment.
+for people: what varies comes first, in words as short as tables and MLflow's lists show whole.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
@@ -24,6 +25,12 @@ VARIED = "rgbt.varied"
 
 # Characters of a value in a name; a longer one, such as a path, is cut in the middle.
 VALUE_LENGTH = 32
+
+# What a setting without a group may have, which says nothing without its key.
+VALUES = ("null", "true", "false", "auto", "none")
+
+# Short words for settings, as the papers write them; others are named by the end of their key.
+SYMBOLS = {"masker.sigma_div": "σ", "masker.patch_size": "patch", "loss.spatial.alpha": "α"}
 
 SILENT = (
     "experiment",
@@ -47,43 +54,40 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
     """Name, tags and parameters of a run.
 
     Only what was typed beside the experiment is named. Of a point of a sweep, what is common to all
-    points follows the experiment: "masker.sigma_div=2 seed=1 · grbm trainer.max_steps=9".
+    points follows the experiment: "σ 2 · s1 · grbm · max_steps 9", and is no parameter: MLflow
+    lists every parameter of the runs that it compares, and draws the first one.
 
     Args:
         spec: the run.
         extra_tags: see `tags_from_environment`.
     """
-    params = {
-        key: str(value)
-        for key, value in flatten(spec.plain).items()
-        # Paths and passwords of the tracker are no property of the run.
-        if not key.endswith("_target_") and not key.startswith("tracking.") and key != "fresh"
-    }
+    settings = {key: str(value) for key, value in flatten(spec.plain).items()}
     # The order is as typed; the last value of a key counts, and a reference by its value.
     words = {}
     for key, equals, value in (word.lstrip("+").partition("=") for word in spec.overrides):
         if key not in SILENT and not key.rpartition("@")[2].startswith(EXTRA_MEASUREMENTS):
-            words[key] = f"{key}{equals}{params.get(key, value) if '${' in value else value}"
+            words[key] = f"{key}{equals}{settings.get(key, value) if '${' in value else value}"
     tags = {
         "rgbt.experiment": spec.name,
         GROUP: " ".join([spec.name, *words.values()]),
         "rgbt.seed": str(spec.seed),
-        "rgbt.lists": lists_of(params),
+        "rgbt.lists": lists_of(settings),
         **(extra_tags or {}),
     }
-    # What varies, a dot, and what does not; outside of a sweep everything may vary.
+    # What varies, and what does not; outside of a sweep everything may vary.
     varied = tags.get(VARIED, "").split()
-    shown = {key: _short(word) for key, word in words.items()}
-    first = [word for key, word in shown.items() if key in varied or not varied]
-    rest = [word for word in shown.values() if word not in first]
-    seed = f"seed={spec.seed}"
-    name = f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
-    if "experiment" in varied:
-        name = " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
+    chosen = {key: word for key, word in words.items() if key in varied or not varied}
+    first = [short_word(word) for word in chosen.values()]
+    rest = [short_word(word) for key, word in words.items() if key not in chosen]
+    seed = f"s{spec.seed}"
+    is_method = "experiment" in varied or not first  # the method is what tells the run apart
+    named = [spec.name, *first, seed] if is_method else [*first, seed, spec.name]
+    values = {key: word.partition("=")[2] for key, word in chosen.items() if "=" in word}
+    params = {**values, "name": spec.name, "seed": str(spec.seed)}
     command = [
         word for word in spec.overrides if not word.lstrip("+").startswith(MACHINE_OVERRIDES)
     ]
-    return Description(name, tags, params, command)
+    return Description(" · ".join([*named, *rest]), tags, params, command)
 
 
 def tags_from_environment() -> dict[str, str]:
@@ -99,13 +103,23 @@ def tags_from_environment() -> dict[str, str]:
         raise InputError(f'{TAGS}={text}: expected JSON such as {{"ticket": "42"}}.') from error
 
 
-def _short(word: str) -> str:
-    """Remove quotes of a word, and cut a long value in its middle, which a digest identifies."""
-    key, equals, value = word.partition("=")
+def short_word(word: str) -> str:
+    """Return an override as people read it: "masker.sigma_div=1.2227" as "σ 1.22".
+
+    Of a file of a group, "masker=crm", only its name is read. Numbers have three significant
+    digits. A long text is cut in its middle, which a digest identifies.
+    """
+    key, equals, value = word.lstrip("+").partition("=")
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         value = value[1:-1]
     if len(value) > VALUE_LENGTH:
         digest = hashlib.sha256(value.encode()).hexdigest()[:4]
         half = (VALUE_LENGTH - len(digest) - 2) // 2
         value = f"{value[:half]}…{digest}…{value[-half:]}"
-    return f"{key}{equals}{value}"
+    elif not value.lstrip("-").isdecimal():
+        with suppress(ValueError):
+            value = f"{float(value):.3g}"
+    is_choice = value.isidentifier() and "." not in key and value not in VALUES
+    if is_choice or not equals:
+        return value or key
+    return f"{SYMBOLS.get(key, key.rpartition('.')[2])} {value}"

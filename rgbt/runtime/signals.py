@@ -14,11 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-WORDS = {
-    signal.SIGINT: "interrupted",
-    signal.SIGTERM: "stopped by SIGTERM",
-    signal.SIGHUP: "stopped by SIGHUP",
-}
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "stopped by SIGTERM"}
+HANGUP = getattr(signal, "SIGHUP", None)  # POSIX: the terminal was closed
+if HANGUP is not None:
+    WORDS[HANGUP] = "stopped by SIGHUP"
 
 
 class Stopped(KeyboardInterrupt):
@@ -53,7 +52,7 @@ def answered() -> Iterator[None]:
         del frame
         if os.getpid() != process:  # a forked process has nothing to clean up
             os._exit(128 + number)
-        for stream in terminals if number == signal.SIGHUP else ():  # closed: every write fails
+        for stream in terminals if number == HANGUP else ():  # closed: every write fails
             with Path(os.devnull).open("w") as nowhere:
                 os.dup2(nowhere.fileno(), stream)
         global _number

@@ -46,7 +46,7 @@ SERVER_S, CALL_S, FILE_S, LOCK_WAIT_S = 9.0, 30.0, 600.0, 50.0
 OUTSIDE = "uri: the store keeps files outside its folder, at {}; name it (uri=...) to trust it."
 
 EXPERIMENT_NOTE = """\
-One run per configuration and seed. mIoU, Var, region/..., class/...: test split, percent (Var:
+One run per configuration and seed. mIoU, Var, IoU1..., class/...: test split, percent (Var:
 squared percent points). In profile/iou_by_region the "step" is the region, 1 = innermost ring.
 Layouts under *Views*: every run, means over seeds, tables."""
 
@@ -99,7 +99,8 @@ class ExperimentClient:
                 self.set_experiment_tag(self.experiment_id, name, value)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        call, limit_s = getattr(self._client, name), FILE_S if "artifact" in name else self._limit_s
+        is_file = "artifact" in name or name == "log_image"
+        call, limit_s = getattr(self._client, name), FILE_S if is_file else self._limit_s
         return lambda *values, **named: _within(limit_s, call, *values, **named)
 
     def check_files(self, artifact_uri: str) -> None:

@@ -17,6 +17,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from rgbt.files.plain_files import read_json, write_json
 from rgbt.metrics import names
 from rgbt.runs.folder import (
@@ -50,6 +52,9 @@ FILES = (
 )
 # Files whose content is sent in another form.
 READ = ("run.json", "metrics.jsonl", "tables.json")
+
+# Figures that the charts of all runs show side by side.
+IMAGES = ("panel", "regions")
 
 TABLE_FILE = "tables/iou.json"
 
@@ -104,7 +109,7 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
     Raises:
         InputError: a file is damaged. MLflow raises anything else.
     """
-    from mlflow.entities import Param, RunTag
+    from mlflow.entities import Metric, Param, RunTag
 
     # Taking the lock has written its file: the time by the clock of the folder's file system.
     began = (folder.path / "mlflow.lock").lstat().st_mtime
@@ -119,6 +124,9 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
     store.check_files(run.info.artifact_uri)
 
     metrics = list(_metrics(lines, tables, result, state))
+    if names.MIOU not in {*run.data.metrics, *(metric.key for metric in metrics)}:
+        # The compare page draws the metric that came first: the score, also before it is known.
+        metrics.insert(0, Metric(names.MIOU, math.nan, run.info.start_time, 0))
     # MLflow refuses to change a parameter.
     new = {key: v for key, v in description.params.items() if key not in run.data.params}
     params = [Param(key, value[:PARAM_LENGTH]) for key, value in new.items()]
@@ -144,8 +152,7 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
     write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
     for file in _own_files(folder):
         if file.stat().st_ctime > state.sent:
-            parent = file.parent.relative_to(path).as_posix()
-            store.log_artifact(state.run_id, str(file), None if parent == "." else parent)
+            _send_file(store, state.run_id, file, file.parent.relative_to(path).as_posix())
     if tables is not None and (path / "tables.json").stat().st_ctime > state.sent:
         store.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
     store.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
@@ -155,6 +162,13 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
         store.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
     state.sent = began
     write_upload_state(folder, state)
+
+
+def _send_file(store: ExperimentClient, run_id: str, file: Path, parent: str) -> None:
+    store.log_artifact(run_id, str(file), None if parent == "." else parent)
+    if file.stem in IMAGES:
+        with Image.open(file) as image:
+            store.log_image(run_id, image, key=file.stem, step=0)
 
 
 def _run_of(

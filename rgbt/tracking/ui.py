@@ -20,7 +20,7 @@ from typing import Annotated
 
 from annotated_types import Interval
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import InputError, RunError, of_posix
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.files.plain_files import check_links, inside
@@ -48,6 +48,7 @@ class Options:
 def main(options: Options, overrides: list[str]) -> int:
     """Open the pages of an MLflow store. Ctrl-C ends their server."""
     del overrides  # none is heeded
+    kill_group = of_posix("os.killpg", "rgbt ui, which ends MLflow's server with its workers,")
     tracking = MlflowTracking(
         options.uri, experiment=options.experiment, runs_dir=str(options.runs_dir)
     )
@@ -91,7 +92,7 @@ def main(options: Options, overrides: list[str]) -> int:
     finally:
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError, subprocess.TimeoutExpired):
-                os.killpg(server.pid, number)
+                kill_group(server.pid, number)
                 server.wait(STOP_S)
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.config.compose import compose
+from rgbt.config.compose import compose, flatten
 from rgbt.config.overrides import composing, words_of_run
 from rgbt.config.stored_config import checkouts, shipped_targets, targets
-from rgbt.runs.folder import GROUP, RunFolder, lists_of, read_description
+from rgbt.runs.folder import GROUP, RunFolder, lists_of
 from rgbt.runs.naming import describe
+from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import requested_run
 from rgbt.terminal import shell_command
@@ -58,22 +60,23 @@ def _trust(run: RunSpec) -> list[str]:
 
 def _other_run(run: RunSpec, folder: RunFolder) -> str:
     """Return the key of the newest finished run of another method on the same images; "": none."""
-    own = describe(run)
+    own, group = _images(run.plain), describe(run).tags[GROUP]
     results = folder.path.parent.glob("*/result.json")
     for result in sorted(results, key=lambda path: -path.stat().st_mtime)[:NEWEST]:
         try:
-            other = read_description(result.parent)
+            other = RunResult(result.parent)
+            is_other_method = other.tags.get(GROUP, group) != group
+            if is_other_method and _images(other.settings) == own:
+                return other.key
         except InputError:  # a damaged run is none to compare with
             continue
-        is_alike = other is not None and _images(other.params) == _images(own.params)
-        if other is not None and is_alike and other.tags.get(GROUP) != own.tags[GROUP]:
-            return result.parent.name
     return ""
 
 
-def _images(params: dict[str, str]) -> tuple[object, ...]:
+def _images(settings: Mapping[str, Any]) -> tuple[object, ...]:
     """Return what two runs that are compared share: the data set, and the lists of its splits."""
-    return {k: v for k, v in params.items() if k.startswith("dataset.")}, lists_of(params)
+    flat = {key: str(value) for key, value in flatten(settings).items() if key != "dataset.root"}
+    return {k: v for k, v in flat.items() if k.startswith("dataset.")}, lists_of(flat)
 
 
 def _other_method(run: RunSpec) -> Sequence[str]:
@@ -86,4 +89,4 @@ def _other_method(run: RunSpec) -> Sequence[str]:
             other = requested_run(compose(words), words)
     except InputError:  # settings of a method that is no experiment of ours
         return []
-    return words if _images(describe(other).params) == _images(describe(run).params) else []
+    return words if _images(other.plain) == _images(run.plain) else []

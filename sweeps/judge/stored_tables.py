@@ -11,6 +11,7 @@ from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.compose import DEFAULT_SCALE, available
 from rgbt.config.stored_config import check_words
 from rgbt.runs.result import RunResult
+from rgbt.terminal import tracked
 from sweeps.judge.judged_table import RESAMPLES, JudgedTable, Resamplers
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import REQUESTED, TAG, RowSeed, TableRequest
@@ -103,7 +104,7 @@ def judged_tables(
     requested = _requested(reader, tables, remarks)
     shared = {variant for _, variant in requested if not variant[2]}
     without_runs = []
-    for name, table in tables.items():
+    for name, table in tracked(tables.items(), "judging", len(tables)):
         own = {variant for requested_table, variant in requested if requested_table == name}
         is_run = False
         for scale, form, words in sorted(own | shared):
@@ -132,7 +133,7 @@ def judged_tables(
         without_runs.append(name)
         if own:
             remarks.append(f"No run that is tagged with '{name}' has the key of a row today.")
-    for name in without_runs:
+    for name in tracked(without_runs, "not run", len(without_runs)):
         request = TableRequest(name, tables[name], DEFAULT_SCALE, (0,))
         sizes = network_sizes(request) if counted else {}
         yield JudgedTable(request=request, sizes=sizes, resamples=resamples, reader=reader)

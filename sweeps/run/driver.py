@@ -18,7 +18,7 @@ from rgbt.runs.folder import MetricLine
 from rgbt.runtime.signals import deferred
 from sweeps.plan.planner import PlannedPoint
 from sweeps.point import Outcome
-from sweeps.run.executors import Executor, open_executor
+from sweeps.run.executors import Executor, open_executor, place_of
 from sweeps.run.job import Work
 from sweeps.run.point_state import work_of
 from sweeps.run.progress import ProgressView
@@ -154,7 +154,8 @@ class Driver:
 
 def drive(view: ProgressView, source: Source, runs: RunStore, settings: SweepSettings) -> None:
     """Execute the points of `source` where the launcher of `settings` says."""
-    executor = open_executor(settings)
-    runs.create_tables()
     with view:
+        view.begin(place_of(settings))
+        executor = open_executor(settings)
+        runs.create_tables()
         Driver(source, runs, executor, settings, view).run()

@@ -27,6 +27,22 @@ class Executor(Protocol):
         """Remove a job that is queued; let one that runs save its step and end."""
 
 
+PLACES = {
+    "basic": "on this machine",
+    "ray": "as tasks of Ray",
+    "submitit_local": "as jobs of submitit on this machine",
+    "submitit_slurm": "as jobs of SLURM",
+}
+
+
+def place_of(settings: SweepSettings) -> str:
+    """Say where the points are executed, and how many at a time."""
+    few = settings.launcher in ("basic", "submitit_local")
+    number = settings.workers or (1 if few else None)
+    limit = "all of them" if number is None else str(number)
+    return f"{PLACES[settings.launcher]}, {limit} at a time"
+
+
 def open_executor(settings: SweepSettings) -> Executor:
     """Return the executor of the launcher; InputError: its settings are wrong."""
     executor: Executor

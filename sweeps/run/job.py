@@ -7,6 +7,7 @@ job may be stopped, repeated, or started twice.
 from __future__ import annotations
 
 import os
+import platform
 import re
 import runpy
 import signal
@@ -22,6 +23,7 @@ from rgbt.files.atomic import is_held
 from rgbt.files.plain_files import read_bytes
 from rgbt.runs.folder import is_finished
 from rgbt.runtime.group import end_with_parent
+from rgbt.runtime.signals import WORDS
 
 TRAINING = "rgbt.run"
 # What a job writes into its log: this, that it started, and how it ended.
@@ -81,7 +83,7 @@ class Job:
     def __call__(self) -> int:
         """Execute the commands; 0, or the exit code of the one that failed (negative: a signal)."""
         self.work.log.parent.mkdir(parents=True, exist_ok=True)
-        self._say(f"{STARTED} on {os.uname().nodename}")
+        self._say(f"{STARTED} on {platform.node()}")
         code = 0
         try:
             for words, run_folder in self.work.steps.items():
@@ -153,7 +155,7 @@ def how_ended(code: int) -> str:
 
 LOST, TOO_LONG = "its job was lost", "stopped after timeout_minutes"
 # Exit codes of a command that a signal has stopped, which resumes.
-STOPPED = tuple(f"exit code {128 + n}" for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
+STOPPED = tuple(f"exit code {128 + n}" for n in WORDS)
 
 
 def failure_reason(log: Path, begin: int) -> str:

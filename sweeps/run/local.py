@@ -18,7 +18,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import InputError, RunError, of_posix
 from rgbt.cores import sleep_while_waiting
 from rgbt.runs.source_code import counted_modules
 from rgbt.runtime.group import end_with_parent
@@ -41,6 +41,7 @@ class LocalExecutor:
             sleep_while_waiting()
         check_gpus(gpus)
         self.slots, self._gpus = slots, gpus
+        of_posix("os.fork", "hydra/launcher=basic, which forks the runs of a sweep,")
         self._context = multiprocessing.get_context("forkserver")
         self._processes: dict[str, BaseProcess] = {}  # by job
         self._jobs: dict[int, str] = {}  # the last one of each slot

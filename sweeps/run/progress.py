@@ -49,7 +49,7 @@ class ProgressView:
 
     def __init__(self, title: str) -> None:
         self._title, self._bars = title, bars()
-        self._all = self._bars.add_task(title)
+        self._all = self._bars.add_task("starting", total=None)
         self._status_at = time.monotonic() + STATUS_S
 
     def __enter__(self) -> None:
@@ -57,6 +57,10 @@ class ProgressView:
 
     def __exit__(self, *error: object) -> None:
         self._bars.stop()
+
+    def begin(self, where: str) -> None:
+        """Say what is run and `where`; jobs may take long to start."""
+        self.say("sweep", f"{self._title}, {where}")
 
     def ended(self, point: RunningPoint, outcome: Outcome) -> None:
         """Show how a point ended, and why."""
@@ -87,13 +91,12 @@ class ProgressView:
         words = ", ".join(f"{number} {word}" for word, number in shown.items() if number)
         lines = [_line(point) for point in running if point.is_started][:LINES]
         shares = sum(point.step / point.steps for point in running)
-        title = f"{self._title}: {words}"
-        description = "\n  ".join([title, *lines])
+        description = "\n  ".join([words, *lines])
         self._bars.update(self._all, completed=done + shares, total=total, description=description)
         if self._bars.disable and time.monotonic() > self._status_at:
             self._status_at = time.monotonic() + STATUS_S
             left = self._bars.tasks[0].time_remaining
-            self.say("state", title if left is None else f"{title}; {duration(left)} left")
+            self.say("state", words if left is None else f"{words}; {duration(left)} left")
             for line in lines:
                 self.say("", f"  {line}")
 

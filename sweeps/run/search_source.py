@@ -6,7 +6,6 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import optuna
@@ -16,7 +15,7 @@ from optuna.trial import Trial, TrialState
 from rgbt.checks import InputError
 from rgbt.metrics.names import in_percent
 from rgbt.runs.folder import MetricLine
-from rgbt.runs.naming import VARIED
+from rgbt.runs.naming import VARIED, short_word
 from sweeps import attributes as names
 from sweeps.plan.planner import PlannedPoint, Planner
 from sweeps.point import Outcome, Point
@@ -141,7 +140,7 @@ class SearchSource:
         chosen, replicates = as_overrides(params), self.settings.replicates
         tags = {f"rgbt.study/{self.study.study_name}": str(trial.number), VARIED: " ".join(params)}
         return Point(
-            label=" ".join([f"#{trial.number}", *(_short(override) for override in chosen)]),
+            label=f"#{trial.number} {' · '.join(map(short_word, chosen))}",
             overrides=(*self.fixed, *chosen),
             params=params,
             tags=tags,
@@ -198,11 +197,3 @@ def _number_of_points(space: Space) -> float:
         else:
             found *= (distribution.high - distribution.low) // (distribution.step or 1) + 1
     return found
-
-
-def _short(override: str) -> str:
-    """Return the label of a parameter: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
-    key, _, value = override.lstrip("+").partition("=")
-    with suppress(ValueError):
-        value = f"{float(value):.4g}"
-    return f"{key.rpartition('.')[2]}={value}"

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from rich.console import Console
-from rich.progress import track
 
 from analysis.results import finished_runs
 from rgbt.checks import InputError
@@ -84,8 +82,7 @@ class Report:
         judged = judged_tables(
             self.reader, planner, known, self.remarks, resamples=resamples, counted=counted
         )
-        bar = track(list(judged), "tables", console=Console(stderr=True))
-        self.tables = [TableSection(table) for table in bar]
+        self.tables = [TableSection(table) for table in judged]
         self.every = claims_of(self.tables)
         were_run = [section.judged for section in self.tables if section.is_run]
         self.contrasts, self.ranks = contrasts_frame(were_run), ranks_of(were_run)

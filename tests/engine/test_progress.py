@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from rgbt.engine.progress import progress, training_log, watch_pace, write_evaluation
+from rgbt.engine.progress import training_log, watch_pace, write_evaluation
+from rgbt.terminal import progress, tracked
 
 
 def warned(
@@ -98,6 +99,7 @@ def test_bar_of_a_terminal_replaces_the_lines(
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=True, width=120)
     monkeypatch.setattr("rgbt.engine.progress.CONSOLE", console)
+    monkeypatch.setattr("rgbt.terminal.CONSOLE", console)
     with progress() as display:
         display.add_task("training", total=3, note="loss 1.0")
         training_log(3)(1, VALUES)
@@ -118,3 +120,24 @@ def test_line_of_an_evaluation(
 ) -> None:
     write_evaluation(9, 35000, "val", score, best)
     assert capsys.readouterr().err == f"    9/35000  {said}\n"
+
+
+def test_a_log_of_a_long_count_has_a_line_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("rgbt.terminal.time", SimpleNamespace(monotonic=lambda: now[0]))
+    for step in tracked(range(1000), "reading", 1000):
+        now[0] += 0.125 if step < 400 else 0.0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("rgbt: reading 80 of 1000, 0:01:55 left")
+    assert [line.split()[2] for line in lines] == ["80", "160", "240", "320", "400"]
+
+
+def test_a_terminal_shows_a_long_count_as_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.StringIO()
+    console = Console(file=shown, force_terminal=True, width=80)
+    monkeypatch.setattr("rgbt.terminal.CONSOLE", console)
+    assert list(tracked("abc", "reading", 3)) == ["a", "b", "c"]
+    last = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", shown.getvalue()).splitlines()[-1]
+    assert re.match(r"\S? *reading .* 3/3 0:00:0\d left 0:00:00", last)

@@ -310,6 +310,8 @@ class FakeView:
 
     def __exit__(self, *error: object) -> None: ...
 
+    def begin(self, where: str) -> None: ...
+
     def ended(self, point: RunningPoint, outcome: Outcome) -> None:
         self.ends.append((point.plan.point.label, outcome.state, outcome.reason))
 

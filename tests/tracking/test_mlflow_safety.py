@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from rgbt.files.atomic import holding
@@ -23,6 +25,7 @@ from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, write_upload_state
 from tests.commands import code_of
 
+PNG = cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()
 SECRET = "the user's own file"
 UPDATE_RUNS = "UPDATE runs SET artifact_uri = '{}/' || run_uuid || '/artifacts'"
 
@@ -112,7 +115,7 @@ def test_a_folder_of_runs_that_was_moved_keeps_its_store(
     folders = [run_folder(tmp_path / "runs" / key) for key in "ab"]
     for folder in folders:
         folder.add_provenance({"started": f"2026-01-0{ord(folder.path.name) - 96}T00:00:00+00:00"})
-        folder.figure_path("panel").write_bytes(b"png")
+        folder.figure_path("panel").write_bytes(PNG)
     assert code_of(sync.entry, [f"runs_dir={tmp_path / 'runs'}"]) == 0
     before = [read_upload_state(folder).run_id for folder in folders]
     shutil.copytree(tmp_path / "runs", tmp_path / "a copy")  # its source stays
@@ -128,7 +131,7 @@ def test_a_folder_of_runs_that_was_moved_keeps_its_store(
             assert found[name].data.tags["rgbt.folder"] == str(place / key)
             files = (place / "mlartifacts" / name / "artifacts").as_uri()
             assert found[name].info.artifact_uri == files
-            assert Path(store.download_artifacts(name, "figures/panel.png")).read_bytes() == b"png"
+            assert Path(store.download_artifacts(name, "figures/panel.png")).read_bytes() == PNG
             assert len(store.get_metric_history(name, "train/loss")) == 1
     assert not (tmp_path / "runs").exists(), "nothing is written there"
 

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
@@ -80,7 +81,9 @@ def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Pa
     def finished(*words: str) -> RunSpec:
         run = specify_run((*words, f"runs_dir={tmp_path}"), checked=False)
         run.folder.mkdir()
-        RunFolder(run.folder).describe(describe(run))
+        folder = RunFolder(run.folder)
+        folder.describe(describe(run))
+        folder.write_config(yaml.safe_dump(run.plain))
         (run.folder / "result.json").touch()
         return run
 

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
-from rgbt.engine.progress import progress
 from rgbt.evaluation.measure import counts_of, of_partition, predictor_of
 from rgbt.evaluation.pairs.frames import FramePairs
 from rgbt.evaluation.pairs.scenes import Compared, FlowRecord, Predict, Scenes, scenes
@@ -26,6 +25,7 @@ from rgbt.metrics.names import CA, TC, consistency
 from rgbt.metrics.pairs import HEADLINES, Protocol, partition_name
 from rgbt.metrics.scores import absent_rule, class_mean
 from rgbt.tables import ConsistencyTable, TextTable
+from rgbt.terminal import progress
 from rgbt.tracking.pair_pictures import PairExample
 
 # Number of the set of views -> (K + 1, K, K) of one scene.

@@ -25,7 +25,6 @@ from rgbt.checks import InputError
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.data.predictions import PredictionReader
 from rgbt.data.video import frames_in_order
-from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.evaluation.pairs.count import CountedPairs, count_predicted, to_bytes
 from rgbt.evaluation.pairs.frames import FramePairs, frame_pairs
@@ -34,6 +33,7 @@ from rgbt.files.plain_files import inside
 from rgbt.metrics import pair_list
 from rgbt.metrics.measurement import Measurement
 from rgbt.metrics.pair_list import PAIR_LIST, ListedPair, PairList, second_name
+from rgbt.terminal import progress
 from rgbt.types import Batch
 
 CPU = torch.device("cpu")

@@ -20,12 +20,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from rgbt.checks import InputError
-from rgbt.engine.progress import progress
 from rgbt.evaluation.profile.networks import PreparedNetwork, ProfiledNetwork, check_networks
 from rgbt.files.atomic import write_atomic
 from rgbt.randomness import numpy_generator
 from rgbt.runs.provenance import machine
 from rgbt.tables import ABSENT, TextTable, csv_text
+from rgbt.terminal import progress
 
 FLOPS = (
     "FLOPs: of convolutions and matrix products; a multiplication and its addition are two "

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from sweeps.point import Outcome, Point
 from sweeps.run import progress
+from sweeps.run.executors import place_of
 from sweeps.run.progress import ProgressView, duration
 
 Make = Callable[[bool], io.StringIO]
@@ -49,6 +50,7 @@ def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
     monkeypatch.setattr(progress, "time", clock)
     view = ProgressView("table")
     with view:
+        view.begin("as tasks of Ray, 2 at a time")
         view.say("started", LABEL)
         for now in (0.5, 1.1, 1.5):
             minutes[0] = now
@@ -56,8 +58,9 @@ def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
         view.ended(RUNNING, FINISHED)
         view.ended(RUNNING, FAILED)
     assert [line[9:].rstrip() for line in text.getvalue().splitlines()] == [
+        "sweep    table, as tasks of Ray, 2 at a time",
         f"started  {LABEL}",
-        "state    table: 1 finished, 1 failed, 1 running, 4 waiting, 1 queued",
+        "state    1 finished, 1 failed, 1 running, 4 waiting, 1 queued",
         f"         {LINE}",
         f"finished {LABEL}  2 min  val mIoU 45.67",
         f"failed   {LABEL}  2 min  val mIoU 45.67: a bad day; see runs/.logs/k.log",
@@ -68,6 +71,10 @@ def test_a_terminal_has_bars_and_lines_of_failures(console: Make) -> None:
     text = console(True)
     view = ProgressView("table")
     with view:
+        view.begin("on this machine, 1 at a time")
+        assert view._bars.tasks[0].total is None, (
+            "nothing is known before the first job has started"
+        )
         for word in ("queued", "started"):
             view.say(word, LABEL)
         view.ended(RUNNING, FINISHED)
@@ -76,8 +83,9 @@ def test_a_terminal_has_bars_and_lines_of_failures(console: Make) -> None:
         probe = Console(file=io.StringIO(), width=160)
         probe.print(view._bars.get_renderable())
         seen = probe.file.getvalue()  # type: ignore[attr-defined]
-        parts = ("table: 1 finished, 1 failed, 1 running, 4 waiting, 1 queued", "/8", LINE.strip())
+        parts = ("1 finished, 1 failed, 1 running, 4 waiting, 1 queued", "/8", LINE.strip())
         assert all(part in seen for part in parts), seen
+    assert "sweep    table, on this machine, 1 at a time" in text.getvalue()
     assert f"failed   {LABEL}  2 min  val mIoU 45.67: a bad day" in text.getvalue()
     assert not any(f"{word:<8} {LABEL}" in text.getvalue() for word in ("started", "finished"))
 
@@ -85,3 +93,17 @@ def test_a_terminal_has_bars_and_lines_of_failures(console: Make) -> None:
 def test_durations_are_read_by_people() -> None:
     shown = {0: "0 s", 89.4: "89 s", 90: "2 min", 3600: "60 min", 12060: "3 h 21 min"}
     assert {seconds: duration(seconds) for seconds in shown} == shown
+
+
+@pytest.mark.parametrize(
+    ("launcher", "workers", "place"),
+    [
+        ("basic", None, "on this machine, 1 at a time"),
+        ("ray", 8, "as tasks of Ray, 8 at a time"),
+        ("submitit_slurm", None, "as jobs of SLURM, all of them at a time"),
+        ("submitit_local", None, "as jobs of submitit on this machine, 1 at a time"),
+    ],
+)
+def test_the_place_of_the_jobs_is_named(launcher: str, workers: int | None, place: str) -> None:
+    settings: Any = SimpleNamespace(launcher=launcher, workers=workers)
+    assert place_of(settings) == place

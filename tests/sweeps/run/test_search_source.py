@@ -48,11 +48,11 @@ def test_the_sampler_is_asked_and_the_point_noted(tmp_path: Path) -> None:
     assert trial.params == {"x": x}
     assert trial.user_attrs == {
         names.RUNS: [plan.key],
-        names.LABEL: f"#0 x={x:.4g}",
+        names.LABEL: f"#0 x {x:.3g}",
         names.PIXELS: 1.0,
     }
     assert point.tags == {"rgbt.study/study": "0", VARIED: "x"}
-    assert (point.label, point.seeds) == (f"#0 x={x:.4g}", ())
+    assert (point.label, point.seeds) == (f"#0 x {x:.3g}", ())
 
 
 def test_a_search_ends_with_its_trials(tmp_path: Path) -> None:
