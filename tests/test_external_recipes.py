@@ -71,7 +71,11 @@ def test_recipe_has_keys_that_differ_and_states_its_source(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "mean", "deviation"),
-    [("imagenet_449", 0.449, 0.226), ("dformer", 0.48, 0.28), ("unit_three", 0.0, 1.0)],
+    [
+        ("imagenet_449", 0.449, 0.226),
+        ("imagenet_449_dformer", 0.48, 0.28),
+        ("unit_three", 0.0, 1.0),
+    ],
 )
 def test_inputs_have_the_constants_of_the_releases(
     name: str, mean: float, deviation: float

@@ -31,6 +31,7 @@ from rgbt.runs.folder import (
     shown_key,
 )
 from rgbt.tables import ResultTables, result_grids, subset_mious, without_nan
+from rgbt.terminal import warn
 from rgbt.tracking.mlflow_client import ExperimentClient
 from rgbt.tracking.mlflow_view import KIND_TAG
 from rgbt.tracking.tracker import Status
@@ -166,9 +167,15 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
 
 def _send_file(store: ExperimentClient, run_id: str, file: Path, parent: str) -> None:
     store.log_artifact(run_id, str(file), None if parent == "." else parent)
-    if file.stem in IMAGES:
-        with Image.open(file) as image:
-            store.log_image(run_id, image, key=file.stem, step=0)
+    if file.stem not in IMAGES:
+        return
+    try:
+        with Image.open(file) as stored:
+            image = stored.convert("RGB")
+    except (OSError, Image.DecompressionBombError) as error:
+        warn(f"{file} is sent as a file and not shown as an image: {error}")
+        return
+    store.log_image(run_id, image, key=file.stem, step=0)
 
 
 def _run_of(
