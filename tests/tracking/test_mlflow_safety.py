@@ -20,6 +20,7 @@ import pytest
 
 from rgbt.files.atomic import holding
 from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.terminal import shell_command
 from rgbt.tracking import mlflow_client, mlflow_store, sync, ui
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, write_upload_state
@@ -198,7 +199,8 @@ def test_a_held_lock_is_waited_for_once(
         tracker = MlflowTracking(runs_dir=str(tmp_path))
         tracker.refresh(folder, Description("grbm", {}, {}))
         assert "TimeoutError: process" in capsys.readouterr().err
-        assert tracker.links() == [("MLflow later", f"rgbt sync run={folder.path}")]
+        command = shell_command("sync", f"run={folder.path}")
+        assert tracker.links() == [("MLflow later", command)]
         assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
         assert capsys.readouterr().err.count("was not sent") == 1
     assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 0
