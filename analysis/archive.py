@@ -12,7 +12,6 @@ now has another key. No stored word is composed (`rgbt.runs.specify.request_agai
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,7 +32,7 @@ from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
-from rgbt.files.atomic import write_atomic
+from rgbt.files.atomic import cache_folder, write_atomic
 from rgbt.files.plain_files import write_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder, find_run, is_finished, read_result, runs_in
@@ -63,8 +62,7 @@ def unpack(path: Path, folder: Path | None = None) -> RunResult:
 
     `folder` None: the cache of the user. InputError: a damaged file, or one of another run.
     """
-    cache, key = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", key_of(path)
-    folder = folder or Path(cache, "rgbt", "archive")
+    folder, key = folder or cache_folder() / "archive", key_of(path)
     target = folder / digest(path.read_bytes()) / key
     if target.is_dir():
         return RunResult(target)

@@ -23,7 +23,7 @@ from rgbt.checks import InputError, one_line, without_controls
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.cores import usable_cores
-from rgbt.files.atomic import check_writable
+from rgbt.files.atomic import cache_folder, check_writable
 
 GB, PROBLEM = 1e9, "problem"
 
@@ -129,8 +129,8 @@ def packages(_: Options) -> Lines:
 
 def folders(options: Options) -> Lines:
     """Yield the folders that are written to, and the free space of their disks."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rgbt"
-    paths = {"runs_dir": options.runs_dir, "cache": cache, "temporary": Path(tempfile.gettempdir())}
+    paths = {"runs_dir": options.runs_dir, "cache": cache_folder()}
+    paths["temporary"] = Path(tempfile.gettempdir())
     for name, path in paths.items():
         whole = path.absolute()
         there = next(place for place in (whole, *whole.parents) if place.exists())

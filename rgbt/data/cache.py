@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.dataset import DatasetWrapper, LabelledDataset
-from rgbt.files.atomic import replacing
+from rgbt.files.atomic import cache_folder, replacing
 from rgbt.types import Sample
 
 
@@ -36,8 +35,7 @@ class CachedDataset(DatasetWrapper):
 
     def __init__(self, dataset: LabelledDataset, folder: str) -> None:
         super().__init__(dataset)
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        self.folder = home / "rgbt/decoded" if folder == "auto" else Path(folder).expanduser()
+        self.folder = cache_folder() / "decoded" if folder == "auto" else Path(folder).expanduser()
         settings = ["upright", type(dataset).__qualname__, dataset.name, dataset.decoding()]
         self._settings = json.dumps(settings, default=str)
 

@@ -30,6 +30,11 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _held: set[int] = set()
 
 
+def cache_folder() -> Path:
+    """Return the user's folder of what can be made again: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "rgbt"
+
+
 def check_writable(setting: str, folder: Path) -> None:
     """Refuse a folder in which nothing can be written or made, before any work; it stays as it is.
 

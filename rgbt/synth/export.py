@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,6 +22,7 @@ from rich.progress import Progress
 
 from rgbt.checks import InputError
 from rgbt.cores import usable_cores
+from rgbt.files.atomic import cache_folder
 from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.light import is_night
 from rgbt.synth.scene import Scene, render_pair, render_scene
@@ -97,8 +97,7 @@ def exported(layout: Layout, plan: ScenePlan, cache_dir: str | Path | None) -> P
     mix. `cache_dir` None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt; InputError if that is impossible.
     """
     text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
-    base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "rgbt"
-    cache = Path(cache_dir or base).expanduser()
+    cache = Path(cache_dir).expanduser() if cache_dir else cache_folder()
     name = plan.name.replace("/", "_")  # of a stored run: no folder outside the cache
     folder = cache / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if folder.is_dir():

@@ -128,22 +128,19 @@ def sides_figure(contrasts: pd.DataFrame, beside: str) -> Figure | None:
     frame, kinds = _sides(contrasts, beside)
     if frame.empty:
         return None
-    groups = list(frame.groupby(["table", "claim", "contrast"], sort=False))
-    figure = new_figure(8.6, 1.6 + 0.24 * len(groups))
+    place = frame.groupby(["table", "claim", "contrast"], sort=False).ngroup()
+    frame = frame.assign(place=place)
+    labelled = frame.drop_duplicates("place")  # in their order
+    figure = new_figure(8.6, 1.6 + 0.24 * len(labelled))
     axes = figure.subplots()
     axes.axvline(0, color="grey", lw=0.8, zorder=1)
-    places = {name: place for place, (name, _) in enumerate(groups)}
-    names = frame[["table", "claim", "contrast"]].itertuples(index=False, name=None)
-    frame = frame.assign(place=[places[name] for name in names])
     for kind in kinds:
         own = frame[frame["kind"] == kind]
         is_beside = kind.startswith(beside)
         colour, shift = (OURS, -0.14) if is_beside else (PALE, 0.14)
         _bars(axes, own, own["place"] + shift, colour, kind)
-    printed = frame.drop_duplicates("place")
-    _printed(axes, printed["printed"], printed["place"])
-    labels = [_name_of(own.iloc[0]) for _, own in groups]
-    _finish(figure, axes, labels)
+    _printed(axes, labelled["printed"], labelled["place"])
+    _finish(figure, axes, [_name_of(row) for _, row in labelled.iterrows()])
     return figure
 
 
