@@ -97,8 +97,8 @@ def judged_tables(
     """Judge tables with runs in every way that they were run, then those without a run.
 
     A run belongs to every table with a row of its key, so that a way without further words is tried
-    for each table. Sizes of networks are counted where `counted`, which needs torch. What cannot
-    be read or composed is added to `remarks`, one sentence each.
+    for each table. Sizes of networks are counted where `counted`, which needs torch. What was
+    requested and cannot be read or composed is added to `remarks`, one sentence each.
     """
     resamplers: Resamplers = {}
     requested = _requested(reader, tables, remarks)
@@ -110,6 +110,7 @@ def judged_tables(
         for scale, form, words in sorted(own | shared):
             request = TableRequest(name, table, scale, (0,), words, form=form)
             rows = requested.get((name, (scale, form, words)), [])
+            runs: dict[RowSeed, Outcome] = {}
             try:
                 runs = _runs_of_variant(request, rows, reader, planner)
                 sizes = network_sizes(request) if counted and runs and not words else {}
@@ -123,7 +124,8 @@ def judged_tables(
                 )
                 _ = judged.scored, judged.claims  # an error is a remark here
             except InputError as error:
-                remarks.append(f"Table '{name}' cannot be scored: {error}")
+                if runs or rows:  # other tables were run in this way, and this one cannot be
+                    remarks.append(f"Table '{name}' cannot be scored: {error}")
                 continue
             if runs:
                 is_run = True

@@ -15,6 +15,7 @@ from rgbt.metrics import names
 from rgbt.metrics.named import value
 from rgbt.metrics.scores import extremes
 from rgbt.runs.folder import GROUP, RunFolder, runs_in
+from rgbt.runs.naming import short_word
 from rgbt.runs.result import RunResult
 from rgbt.tables import number
 from sweeps.run.progress import duration
@@ -85,7 +86,7 @@ def _facts(run: RunResult, reader: RunReader, remarks: list[str]) -> Facts:
     return {
         "run": run,
         "key": run.key,
-        "group": public(one_line(run.tags.get(GROUP, run.key))),
+        "group": run.tags.get(GROUP, run.key),
         "seed": run.tags[SEED],
         "counts": counts,
         "lines": lines,
@@ -103,9 +104,11 @@ def _name(alike: Sequence[Facts]) -> None:
     Charts have numbers instead of long names.
     """
     groups = [run["group"] for run in alike]
-    named, _ = short_names(groups)
+    whole = _as_people_read(short_names(groups)[0])
+    named = {group: public(one_line(name)) for group, name in whole.items()}
     methods = [*dict.fromkeys(groups)]
-    is_short = max(map(len, named.values())) <= MAX_LETTERS
+    # Two methods stay two where their names are cut to the same words.
+    is_short = max(map(len, whole.values())) <= MAX_LETTERS and len({*named.values()}) == len(named)
     for run in alike:
         group, is_alone = run["group"], groups.count(run["group"]) == 1
         seed = "" if is_alone else f", seed {run['seed']}"
@@ -113,6 +116,14 @@ def _name(alike: Sequence[Facts]) -> None:
         # Matplotlib leaves out of legends what begins with "_".
         code = named[group].lstrip("_") if is_short else f"M{methods.index(group) + 1}"
         run["label"], run["series"], run["line"] = named[group] + seed, code, code + seed
+
+
+def _as_people_read(named: Mapping[str, str]) -> Mapping[str, str]:
+    """Write "grbm masker.sigma_div=2" as "grbm · σ 2", unless two methods were named alike."""
+    read = {}
+    for method, name in named.items():
+        read[method] = " · ".join(map(short_word, name.split()))
+    return read if len({*read.values()}) == len(read) else named
 
 
 def _pictured(run: Facts, place: str) -> Facts:

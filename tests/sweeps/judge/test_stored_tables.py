@@ -30,10 +30,12 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
-def judge(runs: Path, table: Table | None = None) -> tuple[list[JudgedTable], list[str]]:
+def judge(
+    runs: Path, table: Table | None = None, **others: Table
+) -> tuple[list[JudgedTable], list[str]]:
     """The tables with runs, and the remarks."""
     reader, remarks = RunReader(finished_runs(runs, runs / "none")), list[str]()
-    tables, planner = {NAME: table or load_table(NAME)}, Planner((f"runs_dir={runs}",))
+    tables, planner = {NAME: table or load_table(NAME)} | others, Planner((f"runs_dir={runs}",))
     return list(judged_tables(reader, planner, tables, remarks, resamples=100)), remarks
 
 
@@ -67,3 +69,13 @@ def test_a_tag_that_no_request_has_is_a_remark(runs: Path, text: str) -> None:
     tables, (remark,) = judge(runs)
     assert sorted(len(table.runs) for table in tables) == [1, 2]
     assert f"Run {path.parent.name} belongs to no table" in remark
+
+
+def test_what_cannot_be_scored_is_a_remark_if_it_was_requested(runs: Path) -> None:
+    wrong = replace(load_table(NAME), at={"bench": ("loss=none_such",)})
+    others = [table for table in judge(runs, other=wrong)[0] if table.request.name == "other"]
+    assert [table.runs for table in others] == [{}]
+    assert judge(runs, other=wrong)[1] == []
+    _, (wrong_word, no_key) = judge(runs, wrong)
+    assert f"Table '{NAME}' cannot be scored: there is no loss 'none_such'" in wrong_word
+    assert "has the key of a row today" in no_key

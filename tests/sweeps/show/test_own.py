@@ -15,7 +15,7 @@ import pytest
 from analysis.results import finished_runs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import extremes
-from rgbt.runs.folder import RunFolder, read_description
+from rgbt.runs.folder import GROUP, RunFolder, read_description
 from rgbt.tracking.pictures import write_strip
 from rgbt.types import Sample
 from sweeps.score.reader import RunReader
@@ -43,6 +43,13 @@ def finish(folder: Path, time: int) -> None:
         label = rng.integers(0, 2, (24, 32)).astype(np.uint8)
         sample = Sample(rgb=rgb, thermal=rgb[..., 0], label=label, name=name)
         write_strip(sample, label, DATASET, run.figure_path(word))
+
+
+def group(folder: Path, name: str) -> None:
+    """Change the group of a run."""
+    known = read_description(folder)
+    assert known is not None
+    RunFolder(folder).describe(replace(known, tags={**known.tags, GROUP: name}))
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +103,32 @@ def test_newest_run_comes_first_with_its_images_and_charts(runs: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (("masker.sigma_div=2", "masker.sigma_div=4"), {"grbm · σ 2", "grbm · σ 4"}),
+        (("~a.lr", "seed.b=1.23456"), {"grbm · ~a.lr", "grbm · b 1.23"}),
+        (("a.lr=1", "b.lr=1"), {"grbm a.lr=1", "grbm b.lr=1"}),  # alike when short
+    ],
+)
+def test_methods_are_named_by_short_words(
+    runs: Path, overrides: Sequence[str], named: set[str]
+) -> None:
+    folders = [path.parent for path in sorted(runs.glob("*/run.json"))]
+    shutil.rmtree(folders[2])
+    for folder, override in zip(folders, overrides, strict=False):
+        group(folder, f"grbm {override} scale=bench")
+    assert {run["label"] for run in section(runs)[0]["own"]} == named
+
+
+def test_methods_of_long_names_stay_apart(runs: Path) -> None:
+    folders = [path.parent for path in sorted(runs.glob("*/run.json"))]
+    for number, folder in enumerate(folders):
+        group(folder, f"grbm {' '.join(f'a.b{key}={number}' for key in range(50))}")
+    (kind,) = section(runs)[0]["kinds"]
+    assert [*kind["codes"]] == ["M1", "M2", "M3"]
+
+
 def test_one_run_is_one_run_and_none_names_a_command(runs: Path, tmp_path: Path) -> None:
     for folder in [path.parent for path in sorted(runs.glob("*/run.json"))][1:]:
         shutil.rmtree(folder)
@@ -130,11 +163,7 @@ def test_missing_wrong_and_damaged_things_are_named(runs: Path) -> None:
 
 def test_text_of_a_run_is_no_markup(runs: Path) -> None:
     for path in runs.glob("*/run.json"):
-        known = read_description(path.parent)
-        assert known is not None
-        evil = "_<img src=http://evil.example/x.png> $x^{"
-        described = replace(known, tags={**known.tags, "rgbt.group": evil})
-        RunFolder(path.parent).describe(described)
+        group(path.parent, "_<img src=http://evil.example/x.png> $x^{")
     own, remarks = section(runs)
     assert remarks == []
     image = "![x](http://evil.example/y.png) <b onclick=a>"
