@@ -64,7 +64,7 @@ class Page:
         end = time.monotonic() + WAIT_S
         while not self.value(f"Boolean({until})"):
             assert time.monotonic() < end, f"never true: {until}\n{self.text()[-3000:]}"
-            time.sleep(0.2)
+            time.sleep(0.05)
 
     def value(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; None where it raises."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from rgbt.checks import InputError, of_posix
 
@@ -134,13 +134,15 @@ def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
     Yields:
         None while the lock is held by us; otherwise who holds it ("process 12 on host").
     """
-    lock = of_posix("fcntl", f"the lock {path}")
+    lock = _locks(path)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     _held.add(descriptor)
     deadline = time.monotonic() + wait_s
     try:
         # Polled: a wait inside flock has no limit, and a stopped process never lets go.
-        while not (is_ours := _take(descriptor, lock.LOCK_EX)) and time.monotonic() < deadline:
+        while (
+            not (is_ours := _take(lock, descriptor, lock.LOCK_EX)) and time.monotonic() < deadline
+        ):
             time.sleep(POLL_S)
         if is_ours:
             os.ftruncate(descriptor, 0)
@@ -157,15 +159,18 @@ def is_held(path: Path) -> bool:
     """Return whether some process, this one included, holds the lock `path`."""
     if not path.is_file():
         return False
+    lock = _locks(path)
     with path.open() as file:  # shared: two that ask at once take no other for a holder
-        return not _take(file.fileno(), of_posix("fcntl", f"the lock {path}").LOCK_SH)
+        return not _take(lock, file.fileno(), lock.LOCK_SH)
 
 
-def _take(descriptor: int, kind: int) -> bool:
-    import fcntl
+def _locks(path: Path) -> Any:
+    return of_posix("fcntl", f"the lock {path}")
 
+
+def _take(lock: Any, descriptor: int, kind: int) -> bool:
     try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        lock.flock(descriptor, kind | lock.LOCK_NB)
     except BlockingIOError:
         return False
     return True
