@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -53,13 +52,6 @@ RESULTS = """[...document.querySelectorAll(".md-search-result__item")].map(
 """Pages that the search finds, best first."""
 
 
-class Handler(SimpleHTTPRequestHandler):
-    """Serves the site in silence."""
-
-    def log_message(self, *_: Any) -> None:
-        """Nothing."""
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the built site."""
@@ -80,7 +72,8 @@ def browser(tmp_path: Path) -> Iterator[Page]:
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
     """Serve a folder on loopback, at the yielded address."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield f"http://127.0.0.1:{server.server_port}"
