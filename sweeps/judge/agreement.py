@@ -175,7 +175,7 @@ def _numbers(verdict: Verdict | None) -> tuple[float, float, float, int]:
 def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     """Count signs as printed among contrasts (`contrasts_frame`), by kind of images and scale.
 
-    Contrasts without printed values do not count.
+    Contrasts without printed values do not count, and one alone is no share.
 
     Returns:
         the columns `SIGNS`: alike of so many contrasts have the printed sign; low and high are the
@@ -192,7 +192,7 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
         known = ours.notna() & group["printed"].notna() & (group["printed"] != 0)
         alike = known & (ours * group["printed"] > 0)
         decided = known & ((low > 0) | (high < 0))
-        if not known.any():
+        if known.sum() < 2:
             continue
         by_table = alike[known].groupby(group["table"][known])
         ends = _share_interval(by_table.sum().to_numpy(), by_table.size().to_numpy())

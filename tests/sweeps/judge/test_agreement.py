@@ -93,6 +93,7 @@ def test_signs_of_different_contrasts_are_counted_once() -> None:
     (found,) = signs_of(contrasts).to_dict("records")
     assert [found[key] for key in SIGNS[2:4] + SIGNS[6:]] == [2, 3, 2, 3]
     assert math.isnan(found["low"]), "one table has no spread over tables"
+    assert signs_of(contrasts[:1]).empty, "one contrast is no share"
     # In another table d scores lowest; its runs of a and b are those of the first.
     shares = {"a": SHARES["a"], "b": SHARES["b"], "d": (10.0, 11.0, 10.5)}
     both = contrasts_frame([first, made("p/two", shares)])

@@ -22,11 +22,16 @@ import yaml
 
 from analysis.archive import _compared, add
 from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.result import RunResult
 from sweeps.report import entry
+from sweeps.score.reader import RunReader
 from sweeps.show.pages import Report
+from sweeps.show.sections import runs_section
+from tests.analysis.counts import result_of
 from tests.commands import Call
+from tests.measured import remeasured
 from tests.models.external.standins import STACKED, write_checkout
 from tests.sweeps.show.planted import plant
 
@@ -262,6 +267,26 @@ def test_odd_records_are_remarks_and_not_the_end(
     assert "| high | ours | 3 |" in found.page("my")
 
 
+def test_folds_of_a_data_set_are_seeds_of_one_method(place: Path, tmp_path: Path) -> None:
+    chosen = [path for path in (place / "runs").glob("*/run.json") if "my/pl" in path.read_text()]
+    for path in chosen:
+        folder = Path(shutil.copytree(path.parent, tmp_path / path.parent.name))
+        known = read_description(folder)
+        assert known is not None
+        seed = known.tags["rgbt.seed"]
+        row = known.tags["rgbt.table/my/planted"]
+        group = f"{row} dataset=mine_fold{seed} dataset.root=a_fold1/b"
+        edit(folder / "run.json", "rgbt.group", group)
+        counts = remeasured(Counts.load(folder / "counts_test.npz"), dataset=seed)
+        counts.save(folder / "counts_test.npz")  # each has images of its own
+        result = {**RunResult(folder).result, **result_of(folder.name, counts)}
+        RunFolder(folder).finish(result)
+    runs = [RunResult(folder) for folder in sorted(tmp_path.iterdir())]
+    (grid,) = runs_section(runs, RunReader(runs), [])["runs"]
+    assert "| `low` | 0, 1, 2 | " in grid
+    assert "All of them with `dataset=mine dataset.root=a_fold1/b`." in grid
+
+
 def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) -> None:
     for number, path in enumerate(sorted((place / "runs").glob("*/run.json"))):
         if "my/planted" in path.read_text():
@@ -320,7 +345,7 @@ def test_marked_numbers_are_made_again_and_nothing_else(report: Report) -> None:
     assert f"count runs -->{len(report.runs)}<!-- /results --> runs." in text
     assert "High is above low. **Same direction** on synthetic scenes: +9.87" in text
     assert "signs -->on synthetic scenes at scale=bench, " in text
-    assert "on synthetic scenes at scale=demo, 1 of 1 contrasts have the printed sign" in text
+    assert "scale=demo, 1 of 1 contrasts" not in text, "one contrast is no share"
     assert "acc low -->49.92 ± 1.31<!-- /results --> points." in text
     assert "No run yet: `rgbt reproduce table=spatial_bias rows=tested" in text
     assert report.filled(text) == text
