@@ -16,13 +16,12 @@ import numpy as np
 from analysis.commands import Archive, DrawOptions, check_out, write_files
 from analysis.results import Evaluation, label_of, open_counts
 from analysis.uncertainty import Comparison, Interval, Resampling, compare, sentence
-from analysis.uncertainty.blocks import FEWEST
 from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics import names, score_grid
-from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.counts import FEWEST, Counts, convention
 from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import parse

@@ -155,7 +155,8 @@ def variables(_: Options) -> Lines:
     from rgbt.runs.provenance import without_passwords
 
     for name in sorted(name for name in os.environ if name.startswith(VARIABLES)):
-        yield "variable", without_passwords(f"{name}={os.environ[name]}")
+        own = ", rgbt's own value" if rgbt.WAITING.get(name) == os.environ[name] else ""
+        yield "variable", without_passwords(f"{name}={os.environ[name]}") + own
 
 
 entry = PlainCommand(Options, main, heeds=())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -53,6 +54,12 @@ def test_help_loads_neither_torch_nor_hydra(tmp_path: Path, words: list[str], sh
     code += "finally: print({'torch', 'hydra', 'omegaconf', 'pydantic'} & set(sys.modules))"
     lines = python(tmp_path, "-c", code).stdout.splitlines()
     assert (lines[0].startswith(shown), lines[-1]) == (True, "set()")
+
+
+def test_reader_that_ends_is_no_error() -> None:
+    line = f"{shlex.quote(sys.executable)} -m rgbt doctor | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("141\n", "")
 
 
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")

@@ -81,6 +81,16 @@ def test_passwords_are_hidden(call: Call, monkeypatch: pytest.MonkeyPatch) -> No
     assert "geheim" not in out + err
 
 
+def test_variables_that_rgbt_sets_are_named_as_its_own(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GOMP_SPINCOUNT", "5000")
+    monkeypatch.setenv("KMP_BLOCKTIME", "200")
+    _, out, _ = call(doctor.entry)
+    found = lines_of(out)["variable"]
+    assert {"GOMP_SPINCOUNT=5000, rgbt's own value", "KMP_BLOCKTIME=200"} <= set(found)
+
+
 def test_whatever_is_missing_is_a_line_and_no_traceback(tmp_path: Path) -> None:
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(tmp_path / "gone")}
     command = [sys.executable, "-c", BARE]

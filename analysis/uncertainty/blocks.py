@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rgbt.checks import InputError, check_choice, check_range
+from rgbt.metrics.counts import FEWEST
 from rgbt.metrics.metric import Absent
 from rgbt.randomness import numpy_generator
 
@@ -22,9 +23,6 @@ Values = NDArray[np.float64]
 
 # Most resamples: more take time without a visible effect.
 MOST = 1_000_000
-
-# Blocks below which an interval would rest on almost nothing.
-FEWEST = 10
 
 # Most numbers in a set of draws that is kept, because many scores need the same draws.
 KEPT = 2**21

@@ -15,12 +15,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from analysis.uncertainty.blocks import FEWEST, ImageBlocks, Resampling, Values, make_blocks
+from analysis.uncertainty.blocks import ImageBlocks, Resampling, Values, make_blocks
 from analysis.uncertainty.intervals import Spread, over_images, over_seeds
 from analysis.uncertainty.same_images import Alike, check_same_kind, in_order
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.counts import FEWEST, Counts, convention
 from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import ParsedMetric, images_of, parse, sums_of, value, values

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.uncertainty.blocks import FEWEST, Resampling
+from analysis.uncertainty.blocks import Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.intervals import (
     Interval,
@@ -21,7 +21,7 @@ from analysis.uncertainty.intervals import (
 )
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import FEWEST, Counts
 from rgbt.metrics.named import images_of, parse
 
 

@@ -1,12 +1,15 @@
 """The list of commands, and the code that parses their options and sets their exit codes.
 
 Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 129, 130 and
-143 stopped by SIGHUP, Ctrl-C and SIGTERM. A failure prints one message on stderr.
+143 stopped by SIGHUP, Ctrl-C and SIGTERM, 141 nobody reads stdout. A failure prints one message on
+stderr.
 """
 
 from __future__ import annotations
 
 import inspect
+import os
+import select
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -81,12 +84,27 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
         if isinstance(error, OSError):
-            file = str(error.filename or "a file")
-            return say(f"{_with_setting(file)}: {error.strerror or error}.", 2)
+            return _code_of(error)
         if type(error).__name__ == "OutOfMemoryError":  # of torch, which --help does not import
             advice = "Use smaller images or batches, or trainer.accelerator=cpu"
             return say(f"{'. '.join(str(error).split('. ')[:2])}. {advice}.", 2)
         raise
+
+
+def _is_unread() -> bool:
+    """Whether the program that reads stdout has ended, as in ``rgbt doctor | head -n 5``."""
+    state = select.poll()
+    state.register(sys.stdout.fileno(), 0)
+    return bool(state.poll(0))
+
+
+def _code_of(error: OSError) -> int:
+    """Say what the system refused, and return the exit code."""
+    if isinstance(error, BrokenPipeError) and _is_unread():
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes at its end
+        return 141
+    file = str(error.filename or "a file")
+    return say(f"{_with_setting(file)}: {error.strerror or error}.", 2)
 
 
 def _with_setting(file: str) -> str:

@@ -259,10 +259,7 @@ def check_dataset(
         of_file = OF_FILE.search(text)
         name = of_file[1] or of_file[2] if of_file else ""
         problems.append((name.removeprefix(f"{dataset.root}/"), text))
-    sizes = sorted({size for report in splits.values() for size in report.sizes})
-    if len(sizes) > 1:
-        ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
-        notes.append(("", f"images differ in size ({ends}); evaluate with data.eval_batch_size=1."))
+    notes += [("", text) for text in (*_mixed_sizes(splits), *_same_lists(dataset, lists))]
     pixels = sum((report.pixels for report in splits.values()), np.zeros(1, np.int64))
     shown = dict(zip(dataset.classes, pixels, strict=False))
     absent = [f"'{n}'" for n in shown if not shown[n] and n not in dataset.unscored]
@@ -403,6 +400,25 @@ def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
                 "it says nothing about them."
             )
     return notes
+
+
+def _mixed_sizes(splits: Mapping[str, SplitReport]) -> Iterator[str]:
+    """Name the settings that images of several sizes need."""
+    sizes = sorted({size for report in splits.values() for size in report.sizes})
+    if len(sizes) > 1:
+        ends = " to ".join(f"{height}x{width}" for height, width in (sizes[0], sizes[-1]))
+        crop = f"{min(height for height, _ in sizes)},{min(width for _, width in sizes)}"
+        yield (
+            f"images differ in size ({ends}); train with 'scale.crop_hw=[{crop}]' or less, and "
+            "data.eval_batch_size=1."
+        )
+
+
+def _same_lists(dataset: FileDataset, lists: SplitNames) -> Iterator[str]:
+    """Name the splits that are read from one list, such as a `val` that is the test part."""
+    for one, other in combinations(lists, 2):
+        if dataset.splits[one] == dataset.splits[other]:
+            yield f"splits {one} and {other} are one list: {other} has no image unseen in {one}."
 
 
 def _list_problems(dataset: FileDataset, lists: SplitNames) -> Sentences:

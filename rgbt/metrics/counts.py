@@ -24,6 +24,9 @@ WORD = re.compile(r"[\w.+-]*")
 # More than the pixels of any image, in the units of `rgbt.metrics.details`; sums do not overflow.
 MOST = 2**40
 
+# Images, or blocks of neighbouring ones, below which an interval would rest on almost nothing.
+FEWEST = 10
+
 MEASUREMENT = "measurement"  # member of a file
 ARCHIVE = Archive("rgbt counts 3", "counts", "evaluate the run to write it")
 

@@ -10,7 +10,8 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose, flatten
 from rgbt.config.overrides import composing, words_of_run
 from rgbt.config.stored_config import checkouts, shipped_targets, targets
-from rgbt.runs.folder import GROUP, RunFolder, lists_of
+from rgbt.metrics.counts import FEWEST, Counts
+from rgbt.runs.folder import GROUP, RunFolder, counts_name, lists_of
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
@@ -34,7 +35,8 @@ BASELINE, OTHER = "baseline", "crm"
 def next_steps(run: RunSpec, folder: RunFolder) -> list[Link]:
     """Name the picture of test images, and commands to predict and to compare with another method.
 
-    Where no other run of these images is finished, the command that trains one.
+    Where no other run of these images is finished, the command that trains one; neither where the
+    test images are too few for `rgbt compare`.
     """
     steps, panel = [], folder.path / "figures" / "panel.png"
     if panel.is_file():
@@ -42,6 +44,9 @@ def next_steps(run: RunSpec, folder: RunFolder) -> list[Link]:
     words = [f"run={folder.path}", "input=test", "out=predicted", *_trust(run)]
     steps.append(("predict", shell_command("predict", *words)))
     steps.append(("", "your own images: input=FOLDER, with the folders rgb and thermal in it"))
+    counts = folder.path / counts_name("test")
+    if counts.is_file() and len(Counts.load(counts).names) < FEWEST:
+        return steps
     if other := _other_run(run, folder):
         words = [f"a={other}", f"b={folder.path.name}", f"runs_dir={folder.path.parent}"]
         steps.append(("compare", shell_command("compare", *words)))

@@ -97,7 +97,9 @@ class JudgedClaim:
         """Our interval beside the printed difference: "includes it", "larger", ...; "": unknown."""
         if self.printed is None or self.verdict is None or self.verdict.interval is None:
             return ""
-        low, high = self.verdict.interval.low, self.verdict.interval.high
+        # Papers print two decimals: -9.797 is the printed -9.80.
+        interval = self.verdict.interval
+        low, high = round(interval.low, 2), round(interval.high, 2)
         if low <= self.printed <= high:
             return "includes it"
         if low <= 0 <= high or self.printed * (low + high) > 0:

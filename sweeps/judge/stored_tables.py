@@ -124,8 +124,9 @@ def judged_tables(
                 )
                 _ = judged.scored, judged.claims  # an error is a remark here
             except InputError as error:
-                if runs or rows:  # other tables were run in this way, and this one cannot be
-                    remarks.append(f"Table '{name}' cannot be scored: {error}")
+                # Without runs and rows, other tables alone were run in this way.
+                remark = f"Table '{name}' cannot be scored: {error}"
+                remarks += [remark] if runs or rows else []
                 continue
             if runs:
                 is_run = True

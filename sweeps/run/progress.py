@@ -67,7 +67,8 @@ class ProgressView:
         text = f"{point.plan.point.label}  {duration(point.seconds)}{_score(point)}"
         if outcome.reason:
             text += f": {outcome.reason}"
-        if outcome.reason and outcome.state == "failed":
+        is_named = str(point.log) in outcome.reason
+        if outcome.reason and outcome.state == "failed" and not is_named:
             text += f"; see {point.log}"
         self.say(outcome.state, text)
 

@@ -89,7 +89,10 @@ def test_check_of_missing_and_shared_lists(write_mfnet) -> None:
     # The parts by time of day only repeat what other lists hold.
     assert sum("test_day.txt" in note or "test_night.txt" in note for note in report.notes) == 2
     shared = MFNet(str(root), splits={"val": "train.txt", "test": "train.txt"})
-    assert check_dataset(shared).problems == ()
+    report = check_dataset(shared)
+    assert report.problems == ()
+    assert "splits val and test are one list: test has no image unseen in val." in report.notes
+    assert not any("are one list" in note for note in checked(write_mfnet(SPLITS)).notes)
 
 
 def test_check_shows_the_range_of_many_sizes(write_mfnet, capsys) -> None:
@@ -101,7 +104,8 @@ def test_check_shows_the_range_of_many_sizes(write_mfnet, capsys) -> None:
     run(root)
     out = capsys.readouterr().out
     assert "20x30 (1) to 24x30 (1), 5 sizes" in out
-    assert "images differ in size (20x30 to 24x32); evaluate with data.eval_batch_size=1." in out
+    expected = "train with 'scale.crop_hw=[20,30]' or less, and data.eval_batch_size=1."
+    assert f"images differ in size (20x30 to 24x32); {expected}" in out
 
 
 def test_check_notes_what_a_split_lacks(write_mfnet, png: Png) -> None:

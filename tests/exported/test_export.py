@@ -157,7 +157,7 @@ def test_what_a_prediction_refuses(
     for file, word, said in (
         (exported, "transform.test_short_edge=24", "takes images of 48x64, got 24x32; export"),
         (exported, "run=any", "exported"),
-        (exported, "modality=rgb", "modality: 'rgb' is not a valid choice"),
+        (exported, "modality=rgb", "corruption=removed:thermal gives it a black one"),
         (tmp_path / "cut.onnx", "", "cut.onnx"),
         (tmp_path / "text.onnx", "", "text.onnx"),
         (tmp_path / "none.onnx", "", "there is no such file"),

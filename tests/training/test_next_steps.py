@@ -12,16 +12,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
+from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import shell_command
 from rgbt.training.next_steps import next_steps
 from sweeps.plan.planner import specify_run
+from tests.measured import measurement
 
 run_folder = partial(RunFolder, writes=False)
 
@@ -96,6 +100,20 @@ def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Pa
     command = dict(next_steps(run, run_folder(run.folder)))["compare"]
     expected = [f"a={other.key}", f"b={run.key}", f"runs_dir={tmp_path}"]
     assert shlex.split(command)[-3:] == expected
+
+
+def test_no_comparison_is_advised_that_is_refused(tmp_path: Path) -> None:
+    run = specify_run(("+experiment=grbm", f"runs_dir={tmp_path}"), checked=False)
+    run.folder.mkdir()
+    folder = RunFolder(run.folder)
+    for number, found in ((9, 0), (10, 1)):  # `rgbt compare` requires ten images
+        data: Any = {"names": tuple(map(str, range(number))), "night": None}
+        data |= {"classes": ("ground", "car"), "measurement": measurement()}
+        counts = Counts(counts=np.ones((number, 5, 2, 2), np.int64), **data)
+        counts.save(run.folder / "counts_test.npz")
+        words = [name for name, _ in next_steps(run, folder)]
+        assert words.count("compare with") == found
+        assert "predict" in words
 
 
 def test_own_classes_are_trusted_by_the_printed_command(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.uncertainty.blocks import FEWEST, Resampling, block_length, make_blocks
+from analysis.uncertainty.blocks import Resampling, block_length, make_blocks
 from rgbt.checks import InputError
+from rgbt.metrics.counts import FEWEST
 
 ROOT = Path(__file__).resolve().parents[3]
 LISTS = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"

@@ -144,6 +144,7 @@ def test_a_claim_about_the_same_runs_is_judged_once() -> None:
     ("printed", "low", "high", "word"),
     [
         (0.75, 0.7, 0.8, "includes it"),
+        (-9.8, -9.797, -9.797, "includes it"),
         (0.75, 9.2, 10.9, "larger"),
         (-0.75, -10.9, -9.2, "larger"),
         (0.75, 0.1, 0.2, "smaller"),

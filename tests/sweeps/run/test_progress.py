@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,6 +58,7 @@ def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
             view.update([RUNNING, QUEUED], COUNTS)
         view.ended(RUNNING, FINISHED)
         view.ended(RUNNING, FAILED)
+        view.ended(RUNNING, replace(FAILED, reason="lost; see runs/.logs/k.log"))
     assert [line[9:].rstrip() for line in text.getvalue().splitlines()] == [
         "sweep    table, as tasks of Ray, 2 at a time",
         f"started  {LABEL}",
@@ -64,6 +66,7 @@ def test_a_log_has_lines_of_begin_and_end_and_of_the_state(
         f"         {LINE}",
         f"finished {LABEL}  2 min  val mIoU 45.67",
         f"failed   {LABEL}  2 min  val mIoU 45.67: a bad day; see runs/.logs/k.log",
+        f"failed   {LABEL}  2 min  val mIoU 45.67: lost; see runs/.logs/k.log",
     ]
 
 
