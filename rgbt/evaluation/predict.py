@@ -92,7 +92,7 @@ def view_of(session: Session, view: View | None = None) -> View:
     known = record_of(session.model, NetworkRecord).views
     if view is None:
         return session.domains.source.view or known[0]
-    if known == ("rgbt",) != (view,):
+    if known == ("rgbt",) and view != "rgbt":
         other = "thermal" if view == "rgb" else "rgb"
         raise InputError(
             f"modality={view}: this network needs both images; in rgbt predict and evaluate, "
