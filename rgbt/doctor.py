@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module, metadata
 from pathlib import Path
@@ -44,6 +44,9 @@ VARIABLES = (
     *("SLURM_JOB_ID", "XDG_CACHE_HOME", "PYTHONPATH", "VIRTUAL_ENV", "CONDA_PREFIX"),
 )
 
+# Names of variables whose whole value is hidden: it may have spaces.
+SECRET = re.compile("PASS|SECRET|TOKEN|KEY|CRED")
+
 # A line of our metadata: the name of a package, and the extra that needs it, if not all do.
 REQUIREMENT = re.compile(r"([\w.-]+)(?:.*extra == ['\"]([\w-]+))?")
 
@@ -65,14 +68,17 @@ def main(options: Options, _: list[str]) -> int:
     """
     code = 0
     for check in (machine, torch_build, packages, folders, store, variables):
-        try:
-            lines = list(check(options))
-        except Exception as error:  # whatever is missing or broken is what is to be shown
-            lines = [(PROBLEM, f"{check.__name__}: {type(error).__name__}: {one_line(error)}")]
-        for name, text in lines:
+        for name, text in _until_error(check, options):
             sys.stdout.write(without_controls(f"{name:<11} {text}\n"))
             code = code or int(name == PROBLEM)
     return code
+
+
+def _until_error(check: Callable[[Options], Lines], options: Options) -> Lines:
+    try:
+        yield from check(options)
+    except Exception as error:  # whatever is missing or broken is what is to be shown
+        yield PROBLEM, f"{check.__name__}: {type(error).__name__}: {one_line(error)}"
 
 
 def machine(_: Options) -> Lines:
@@ -82,6 +88,8 @@ def machine(_: Options) -> Lines:
     yield "command", found or "the shell does not find rgbt; activate the environment"
     yield "python", f"{platform.python_version()} ({sys.executable})"
     yield "system", f"{platform.platform()}, {usable_cores()} of {os.cpu_count()} cores usable"
+    if not hasattr(os, "sysconf"):  # Windows
+        return
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB
     linux = Path("/proc/meminfo")
     free = re.search(r"MemAvailable: *(\d+)", linux.read_text()) if linux.exists() else None
@@ -91,12 +99,15 @@ def machine(_: Options) -> Lines:
 def torch_build(_: Options) -> Lines:
     """Yield driver, build of torch and cards, and whether they fit each other."""
     query = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    drivers: list[str] = []
     try:
         done = subprocess.run(query, capture_output=True, text=True, timeout=30, check=True)
         drivers = done.stdout.splitlines()
-    except (OSError, subprocess.SubprocessError):
-        drivers = []
-    yield "driver", "; ".join(drivers) or "no NVIDIA driver found"
+        yield "driver", "; ".join(drivers)
+    except FileNotFoundError:
+        yield "driver", "no NVIDIA driver found"
+    except (OSError, subprocess.SubprocessError) as error:
+        yield "driver", f"nvidia-smi: {one_line(getattr(error, 'stdout', None) or error)}"
     torch = import_module("torch")
     build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
     yield "torch", f"{torch.__version__}, {build}, {torch.get_num_threads()} threads"
@@ -152,11 +163,12 @@ def store(options: Options) -> Lines:
 
 def variables(_: Options) -> Lines:
     """Yield the environment variables that change what rgbt does."""
-    from rgbt.runs.provenance import without_passwords
+    from rgbt.runs.provenance import HIDDEN, without_passwords
 
     for name in sorted(name for name in os.environ if name.startswith(VARIABLES)):
         own = ", rgbt's own value" if rgbt.WAITING.get(name) == os.environ[name] else ""
-        yield "variable", without_passwords(f"{name}={os.environ[name]}") + own
+        value = HIDDEN if SECRET.search(name) else os.environ[name]
+        yield "variable", without_passwords(f"{name}={value}") + own
 
 
 entry = PlainCommand(Options, main, heeds=())

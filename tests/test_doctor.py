@@ -74,7 +74,9 @@ def test_shows_versions_build_folders_and_extras(
 
 def test_passwords_are_hidden(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "https://me:geheim1@host/x")
-    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "geheim2")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "geheim2 and geheim4")
+    for number, word in enumerate(("UC_OSS_TOKEN", "FLASK_SERVER_SECRET_KEY", "KEK_PASSPHRASE")):
+        monkeypatch.setenv(f"MLFLOW_{word}", f"geheim{number}")
     _, out, err = call(doctor.entry, "uri=postgresql://me:geheim3@host/x")
     assert "MLFLOW_TRACKING_URI=https://me:***@host/x" in out
     assert "postgresql://me:***@host/x, not contacted" in out
@@ -98,6 +100,7 @@ def test_whatever_is_missing_is_a_line_and_no_traceback(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "")
     found = lines_of(done.stdout)
     assert "torch_build: ModuleNotFoundError: No module named 'torch'" in found["problem"]
+    assert "driver" in found, "what was found before the error stays"
     assert any(re.match("not installed: .*, torch$", line) for line in found["problem"])
     assert found["[ray]"] == ["not installed: ray"]
     assert {"python", "system", "memory", "runs_dir", "cache"} <= set(found)
@@ -132,6 +135,15 @@ def test_driver_and_build_of_torch_are_compared(
     assert (code, len(found.get("problem", []))) == ((1, 1) if problem else (0, 0))
     assert problem in "".join(found.get("problem", []))
     assert ("GPU" in found) == (cards > 0)
+
+
+def test_driver_that_fails_is_there(call: Call, tmp_path: Path, monkeypatch: Any) -> None:
+    said = "Failed to initialize NVML: Driver/library version mismatch"
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f"#!/bin/sh\necho '{said}'\nexit 18\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    assert lines_of(call(doctor.entry)[1])["driver"] == [f"nvidia-smi: {said}"]
 
 
 def test_folder_that_cannot_be_written_is_a_problem(call: Call) -> None:

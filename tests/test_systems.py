@@ -32,7 +32,7 @@ for package in (rgbt, sweeps, analysis):
         if not module.name.endswith(("__main__", "ray_tasks", "submitit_jobs")):
             importlib.import_module(module.name)
 from pathlib import Path
-from rgbt import __main__, api
+from rgbt import __main__, api, doctor
 from rgbt.checks import InputError
 from rgbt.data.loaders import _blocked
 from rgbt.files.atomic import write_atomic
@@ -42,6 +42,7 @@ from sweeps.run.local import LocalExecutor
 write_atomic(Path("file"), b"content")
 with _blocked(0):
     print(Path("file").read_text())
+print(*(name for name, _ in doctor.machine(doctor.Options())))
 for refused in (
     LocalExecutor, _blocked(2).__enter__, lambda: ui.main(ui.Options(), []), __main__.main
 ):
@@ -52,6 +53,7 @@ for refused in (
 """
 LINES = (
     "content",
+    "rgbt command python system",
     "hydra/launcher=basic, which forks the runs of a sweep, needs os.fork",
     "data.num_workers=2 needs signal.pthread_sigmask",
     "rgbt ui, which ends MLflow's server with its workers, needs os.killpg",
