@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from rgbt.config.stored_config import checkouts, shipped_targets, targets
 from rgbt.metrics.counts import FEWEST, Counts
 from rgbt.runs.folder import GROUP, RunFolder, counts_name, lists_of
 from rgbt.runs.naming import describe
+from rgbt.runs.provenance import without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import requested_run
@@ -25,7 +27,7 @@ NEWEST = 20
 # Beginnings of the words that a run of another method has too, to be trained on the same images.
 SHARED = (
     *("dataset", "scale", "recipe", "trainer.", "data.", "seed=", "runs_dir=", "tracking"),
-    "+debug=",
+    "debug=",
 )
 
 # The method to compare with, and that for the baseline itself.
@@ -51,7 +53,8 @@ def next_steps(run: RunSpec, folder: RunFolder) -> list[Link]:
         words = [f"a={other}", f"b={folder.path.name}", f"runs_dir={folder.path.parent}"]
         steps.append(("compare", shell_command("compare", *words)))
     elif found := _other_method(run):
-        steps.append(("compare with", shell_command("run", *words_of_run(found))))
+        # In a log, a password is not shown: it has to be typed again.
+        steps.append(("compare with", shell_command("run", *map(without_passwords, found))))
     return steps
 
 
@@ -67,15 +70,25 @@ def _other_run(run: RunSpec, folder: RunFolder) -> str:
     """Return the key of the newest finished run of another method on the same images; "": none."""
     own, group = _images(run.plain), describe(run).tags[GROUP]
     results = folder.path.parent.glob("*/result.json")
-    for result in sorted(results, key=lambda path: -path.stat().st_mtime)[:NEWEST]:
-        try:
+    for result in sorted(results, key=_time_of, reverse=True)[:NEWEST]:
+        # A run that is damaged, moved or another user's is none to compare with.
+        with suppress(InputError, OSError):
             other = RunResult(result.parent)
             is_other_method = other.tags.get(GROUP, group) != group
-            if is_other_method and _images(other.settings) == own:
+            is_as_long = _steps(other.settings) == _steps(run.plain)
+            if is_as_long and is_other_method and _images(other.settings) == own:
                 return other.key
-        except InputError:  # a damaged run is none to compare with
-            continue
     return ""
+
+
+def _time_of(path: Path) -> float:
+    with suppress(OSError):
+        return path.stat().st_mtime
+    return 0.0
+
+
+def _steps(settings: Mapping[str, Any]) -> object:
+    return settings.get("trainer", {}).get("max_steps")
 
 
 def _images(settings: Mapping[str, Any]) -> tuple[object, ...]:
@@ -87,11 +100,11 @@ def _images(settings: Mapping[str, Any]) -> tuple[object, ...]:
 def _other_method(run: RunSpec) -> Sequence[str]:
     """Return the words of a run of another method on the same images; []: they do not compose."""
     name = OTHER if run.name == BASELINE else BASELINE
-    typed = [word for word in run.overrides if word.startswith(SHARED)]
+    typed = [word for word in run.overrides if word.lstrip("+").startswith(SHARED)]
     words = [f"+experiment={name}", *typed]
     try:
         with composing(words):
             other = requested_run(compose(words), words)
     except InputError:  # settings of a method that is no experiment of ours
         return []
-    return words if _images(other.plain) == _images(run.plain) else []
+    return words_of_run(words) if _images(other.plain) == _images(run.plain) else []

@@ -81,6 +81,21 @@ def test_other_method_has_the_words_of_the_same_images_alone() -> None:
     )
 
 
+def test_password_of_the_store_is_not_printed() -> None:
+    words = (
+        "+experiment=grbm",
+        "++trainer.max_steps=9",
+        "tracking.uri=postgresql://me:secret@host/x",
+    )
+    run = specify_run(words, checked=False)
+    steps = dict(next_steps(run, run_folder(run.folder)))
+    assert shlex.split(steps["compare with"])[-2:] == [
+        "++trainer.max_steps=9",
+        "tracking.uri=postgresql://me:***@host/x",
+    ]
+    assert "secret" not in "".join(steps.values())
+
+
 def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Path) -> None:
     def finished(*words: str) -> RunSpec:
         run = specify_run((*words, f"runs_dir={tmp_path}"), checked=False)
@@ -95,6 +110,8 @@ def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Pa
     finished("+experiment=grbm", "seed=1")
     finished("+experiment=baseline", "dataset.num_test=12")
     finished("+experiment=baseline", "dataset.splits.train=val", "dataset=mfnet", "dataset.root=x")
+    finished("+experiment=baseline", "trainer.max_steps=2")
+    (finished("+experiment=baseline").folder / "config.yaml").unlink()  # damaged
     assert "compare" not in dict(next_steps(run, run_folder(run.folder)))
     other = finished("+experiment=crm")
     command = dict(next_steps(run, run_folder(run.folder)))["compare"]
