@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
@@ -60,9 +62,10 @@ def own_section(
         counts = facts["counts"]
         kinds.setdefault((counts.dataset, counts.classes, counts.partition), []).append(facts)
     for alike in kinds.values():
+        _separate(alike)
         _name(alike)
     settings, numbers = Resampling(resamples=resamples), count()
-    scores = [facts["miou"] for facts in own]
+    scores = [facts["miou"] for facts in own if not math.isnan(facts["miou"])]
     ends = [number(end) for end in (min(scores), max(scores))] if scores else []
     place = "" if runs_dir.is_absolute() else f"{runs_dir}/"
     return {
@@ -83,6 +86,9 @@ def _facts(run: RunResult, reader: RunReader, remarks: list[str]) -> Facts:
         remarks.append(f"Learning curve of {run.key}: {one_line(error)}")
     name = counts.measurement.dataset_name
     steps = number_of(int(run.result.get("steps", 0)), "step")
+    seconds = duration(float(run.result["seconds_of_last_process"]))
+    processes, miou = len(run.provenance), value(names.MIOU, counts, counts.absent)
+    resumed = f" in the last of {processes} processes" * (processes > 1)
     return {
         "run": run,
         "key": run.key,
@@ -91,11 +97,19 @@ def _facts(run: RunResult, reader: RunReader, remarks: list[str]) -> Facts:
         "counts": counts,
         "lines": lines,
         "time": lines[-1].time if lines else 0.0,
-        "miou": value(names.MIOU, counts, counts.absent),
-        "var": value(names.VAR, counts, counts.absent),
+        "miou": miou,
+        "shown": [number(miou), number(value(names.VAR, counts, counts.absent))],
         "of": number_of(len(counts.names), "test image") + (f" of {name}" if name else ""),
-        "trained": f"{steps}, {duration(float(run.result['seconds_of_last_process']))}",
+        "trained": f"{steps}, {seconds}{resumed}",
     }
+
+
+def _separate(alike: Sequence[Facts]) -> None:
+    """Make methods of their own of runs with one seed, which differ in their files of settings."""
+    trainings = [(run["group"], run["seed"]) for run in alike]
+    for run, training in zip(alike, trainings, strict=True):
+        if trainings.count(training) > 1:
+            run["group"] += f" {run['key']}"
 
 
 def _name(alike: Sequence[Facts]) -> None:
@@ -107,14 +121,16 @@ def _name(alike: Sequence[Facts]) -> None:
     whole = _as_people_read(short_names(groups)[0])
     named = {group: public(one_line(name)) for group, name in whole.items()}
     methods = [*dict.fromkeys(groups)]
-    # Two methods stay two where their names are cut to the same words.
-    is_short = max(map(len, whole.values())) <= MAX_LETTERS and len({*named.values()}) == len(named)
+    # Two methods stay two where their names are cut to the same words, and Matplotlib leaves out
+    # of legends what begins with "_".
+    is_apart = len({*named.values()}) == len(named)
+    begin_well = all(name[:1] not in ("", "_") for name in named.values())
+    is_short = is_apart and begin_well and max(map(len, whole.values())) <= MAX_LETTERS
     for run in alike:
         group, is_alone = run["group"], groups.count(run["group"]) == 1
         seed = "" if is_alone else f", seed {run['seed']}"
         run["method"] = named[group]
-        # Matplotlib leaves out of legends what begins with "_".
-        code = named[group].lstrip("_") if is_short else f"M{methods.index(group) + 1}"
+        code = named[group] if is_short else f"M{methods.index(group) + 1}"
         run["label"], run["series"], run["line"] = named[group] + seed, code, code + seed
 
 
@@ -140,15 +156,15 @@ def _pictured(run: Facts, place: str) -> Facts:
         try:
             of_image, legend, pictures = stored_pictures(path)
         except InputError as error:
-            missing.append(public(one_line(error)))
+            missing.append(f"{public(one_line(error))}: remove it")
             continue
         if of_image == name:
             images.append(
                 {"word": word, "name": name, "score": number(score), "pictures": pictures}
             )
         else:
-            missing.append(f"{path.name} is of '{of_image}' and not of '{name}'")
-    command = f"rgbt evaluate run={place}{run['key']}"
+            missing.append(f"{path.name} is of '{of_image}' and not of '{name}': remove it")
+    command = shlex.join(["rgbt", "evaluate", f"run={place}{run['key']}"])
     return {**run, "images": images, "legend": legend, "missing": missing, "command": command}
 
 
@@ -162,7 +178,7 @@ def _kind(
     for title, make in _makers(shown, settings, remarks).items():
         try:
             charts.append((title, _drawn(make(), title, next(numbers))))
-        except InputError as error:
+        except (*ODD, ArithmeticError) as error:  # numbers of a log that no axis holds
             remarks.append(f"{title}: {one_line(error)}")
     note = ""
     if len(methods) > MAX_CHARTED:
@@ -225,7 +241,7 @@ def _unfinished(runs_dir: Path) -> Iterator[str]:
             steps = RunResult(folder.path).settings["trainer"]["max_steps"]
             name = one_line(RunResult(folder.path).tags.get(EXPERIMENT, "a run"))
             state = f"{name}, step {reached} of {steps}"
-        except (*ODD, OSError) as error:
-            state = one_line(error)
-        now = "is being trained" if folder.is_locked() else "is not finished"
+            now = "is being trained" if folder.is_locked() else "is not finished"
+        except ODD as error:
+            state, now = one_line(error), "is not finished"
         yield public(f"{folder.path.name} {now}: {state}.")

@@ -22,7 +22,7 @@ from sweeps.score.reader import RunReader
 from sweeps.show.html import html_page
 from sweeps.show.own import own_section
 from tests.browser import CHROMIUM, open_page
-from tests.measured import store
+from tests.measured import remeasured, store
 from tests.sweeps.show.planted import plant
 
 TABLE3 = {"CRM baseline": (50.0, 51.0), "Ny/4": (60.0,)}
@@ -45,11 +45,16 @@ def finish(folder: Path, time: int) -> None:
         write_strip(sample, label, DATASET, run.figure_path(word))
 
 
-def group(folder: Path, name: str) -> None:
-    """Change the group of a run."""
+def tag(folder: Path, name: str, text: str) -> None:
+    """Change a tag of a run."""
     known = read_description(folder)
     assert known is not None
-    RunFolder(folder).describe(replace(known, tags={**known.tags, GROUP: name}))
+    RunFolder(folder).describe(replace(known, tags={**known.tags, name: text}))
+
+
+def group(folder: Path, name: str) -> None:
+    """Change the group of a run."""
+    tag(folder, GROUP, name)
 
 
 @pytest.fixture(scope="module")
@@ -121,12 +126,62 @@ def test_methods_are_named_by_short_words(
     assert {run["label"] for run in section(runs)[0]["own"]} == named
 
 
-def test_methods_of_long_names_stay_apart(runs: Path) -> None:
-    folders = [path.parent for path in sorted(runs.glob("*/run.json"))]
-    for number, folder in enumerate(folders):
-        group(folder, f"grbm {' '.join(f'a.b{key}={number}' for key in range(50))}")
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"grbm {' '.join(f'a.b{key}={number}' for key in range(50))}" for number in range(3)],
+        ["_a", "a", "__"],  # no legend of Matplotlib has a name that begins with "_"
+    ],
+)
+def test_methods_of_long_and_odd_names_stay_apart(runs: Path, names: Sequence[str]) -> None:
+    for path, name in zip(sorted(runs.glob("*/run.json")), names, strict=True):
+        group(path.parent, name)
     (kind,) = section(runs)[0]["kinds"]
     assert [*kind["codes"]] == ["M1", "M2", "M3"]
+
+
+def test_runs_of_one_seed_are_no_seeds_of_one_method(runs: Path) -> None:
+    """Their overrides are alike, and the files of their settings were changed in between."""
+    keys = [path.parent.name for path in sorted(runs.glob("*/run.json"))]
+    for key, seed in zip(keys, "110", strict=True):
+        group(runs / key, "grbm")
+        tag(runs / key, "rgbt.seed", seed)
+    own, _ = section(runs)
+    assert {run["key"]: run["line"] for run in own["own"]} == {
+        keys[0]: f"grbm · {keys[0]}",
+        keys[1]: f"grbm · {keys[1]}",
+        keys[2]: "grbm",
+    }
+
+
+def test_undefined_scores_and_a_resumed_training_are_said(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, _ = (path.parent for path in sorted(runs.glob("*/run.json")))
+    counts = Counts.load(first / "counts_test.npz")
+    matrices = counts.counts.copy()
+    matrices[..., 1:, :] = 0  # labels of one class
+    undefined = remeasured(replace(counts, counts=matrices), absent="exclude")
+    undefined.save(first / "counts_test.npz")
+    RunFolder(second).add_provenance({"started": "2026-01-02T00:00:00+00:00"})
+    (second / "figures" / "best.png").unlink()
+    runs.rename(tmp_path / "my runs")
+    monkeypatch.chdir(tmp_path)
+    own, _ = section(Path("my runs"))
+    text = page(own)
+    assert len(own["own"]) == 3
+    assert "nan" not in own["range"]
+    assert "<b>mIoU - %</b> · variance over regions - ·" in text
+    assert text.count(" in the last of 2 processes") == 1
+    assert f"<code>rgbt evaluate &#39;run=my runs/{second.name}&#39;</code>" in text
+
+
+def test_numbers_that_no_axis_holds_are_a_remark(runs: Path) -> None:
+    run = RunFolder(next(runs.glob("*/run.json")).parent)
+    run.append(10**400, "train", {"loss": 1.0})
+    own, remarks = section(runs)
+    assert [remark for remark in remarks if remark.startswith("Learning curves: ")]
+    assert len(own["kinds"][0]["charts"]) == 3
 
 
 def test_one_run_is_one_run_and_none_names_a_command(runs: Path, tmp_path: Path) -> None:
@@ -152,6 +207,7 @@ def test_missing_wrong_and_damaged_things_are_named(runs: Path) -> None:
     spoilt = found[newest.name]
     assert spoilt["missing"][0] == "median.png is missing"
     assert spoilt["missing"][1].startswith("worst.png is of '")
+    assert spoilt["missing"][1].endswith(": remove it"), "the command draws missing ones alone"
     assert "best.png cannot be decoded" in found[others[0].name]["missing"][0]
     (unfinished,) = own["unfinished"]
     assert unfinished.startswith(f"{others[1].name} is not finished: ")
