@@ -116,7 +116,7 @@ def short_word(word: str) -> str:
         digest = hashlib.sha256(value.encode()).hexdigest()[:4]
         half = (VALUE_LENGTH - len(digest) - 2) // 2
         value = f"{value[:half]}…{digest}…{value[-half:]}"
-    elif not value.lstrip("-").isdecimal():
+    elif "." in value and "_" not in value:  # Python reads 2024_1 and 12e34 as numbers
         with suppress(ValueError):
             value = f"{float(value):.3g}"
     is_choice = value.isidentifier() and "." not in key and value not in VALUES

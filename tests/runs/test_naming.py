@@ -63,6 +63,9 @@ def test_what_a_search_varies_is_named_first_with_three_digits() -> None:
         ("masker=none", "masker none"),
         ("~masker.ratio", "~masker.ratio"),
         ("loss.spatial.alpha=-0.5555", "α -0.555"),
+        ("optimizer.lr=1.23456e-05", "lr 1.23e-05"),
+        ("recipe.dataset=2024_11", "dataset 2024_11"),
+        ("teacher.run=2062320e7012", "run 2062320e7012"),
     ],
 )
 def test_word_for_people(word: str, shown: str) -> None:
