@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -132,7 +133,7 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
     new = {key: v for key, v in description.params.items() if key not in run.data.params}
     params = [Param(key, value[:PARAM_LENGTH]) for key, value in new.items()]
     texts = {
-        "mlflow.user": getpass.getuser(),
+        "mlflow.user": _user(),
         "mlflow.source.type": "LOCAL",
         "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
         "rgbt.command": process.get("command", ""),
@@ -163,6 +164,12 @@ def upload(store: ExperimentClient, folder: RunFolder, state: UploadState, statu
         store.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
     state.sent = began
     write_upload_state(folder, state)
+
+
+def _user() -> str:
+    with suppress(KeyError, OSError):  # in a container, a number may have no name
+        return getpass.getuser()
+    return ""
 
 
 def _send_file(store: ExperimentClient, run_id: str, file: Path, parent: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -199,6 +200,16 @@ def test_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None
     experiment = store.get_experiment_by_name("rgbt")
     assert view_tags().items() <= experiment.tags.items()
     assert experiment.artifact_location == (runs_dir / "mlartifacts").as_uri()
+
+
+def test_a_user_without_a_name_is_tracked(runs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that runs as a number: Python knows no name for it."""
+    for name in ("LOGNAME", "USER", "LNAME", "USERNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 54321)
+    folder = RunFolder(runs_dir / "nameless")
+    begin(folder, tracking(runs_dir))
+    assert run_of(runs_dir, folder).data.tags.items() >= TAGS.items()
 
 
 def test_replaced_run_and_its_successor_are_two_mlflow_runs(runs_dir: Path) -> None:
