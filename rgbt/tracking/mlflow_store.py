@@ -54,6 +54,7 @@ class MlflowTracking(Tracking):
         root = Path(runs_dir).resolve()
         self.uri = f"{SQLITE}{root / 'mlflow.db'}" if uri is None else uri
         self._files = root if uri is None and artifact_uri is None else None
+        self._place = [] if artifact_uri is None else [f"artifact_uri={artifact_uri}"]
         if artifact_uri is None and not self.uri.startswith("http"):
             artifact_uri = (root / ARTIFACTS).as_uri()
         self.artifact_uri, self.experiment = artifact_uri, experiment
@@ -109,7 +110,8 @@ class MlflowTracking(Tracking):
 
     def _later(self) -> str:
         named = [word for word in self._words if not word.startswith("runs_dir=")]
-        return shell_command("sync", f"run={self._folder.path}", *named)
+        place = map(without_passwords, self._place)  # that of a new experiment never changes
+        return shell_command("sync", f"run={self._folder.path}", *named, *place)
 
     def sync(self, folder: RunFolder, status: Status) -> str:
         """Bring this store up to date; return the id of the MLflow run. Raises what it raises."""

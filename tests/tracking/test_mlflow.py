@@ -248,8 +248,8 @@ def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
 def test_dead_tracker_warns_once_and_sync_fills_it_later(
     runs_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = RunFolder(runs_dir / "dead")
-    tracker = tracking(runs_dir, DEAD)
+    folder, files = RunFolder(runs_dir / "dead"), "s3://bucket/files"
+    tracker = MlflowTracking(DEAD, artifact_uri=files, runs_dir=str(runs_dir))
     begin(folder, tracker)
     folder.append(5, "train", {"loss": 5.0})
     tracker.update()
@@ -257,7 +257,7 @@ def test_dead_tracker_warns_once_and_sync_fills_it_later(
     tracker.finish("FAILED")
     warning = capsys.readouterr().err
     assert warning.count("rgbt: MLflow at http://127.0.0.1:9 cannot be used") == 1
-    assert f"rgbt sync run={folder.path} uri={DEAD}\n" in warning
+    assert f"rgbt sync run={folder.path} uri={DEAD} artifact_uri={files}\n" in warning
     assert code_of(sync.entry, [f"run={folder.path}"]) == 0
     assert run_id(folder) in capsys.readouterr().out
     assert points(client(runs_dir), run_id(folder), "train/loss") == [(5, 5.0)]
