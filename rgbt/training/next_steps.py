@@ -43,7 +43,9 @@ def next_steps(run: RunSpec, folder: RunFolder) -> list[Link]:
     steps, panel = [], folder.path / "figures" / "panel.png"
     if panel.is_file():
         steps.append(("look at", str(panel)))
-    words = [f"run={folder.path}", "input=test", "out=predicted", *_trust(run)]
+    # The images of two runs have the same names.
+    out = f"out=predicted/{folder.path.name}"
+    words = [f"run={folder.path}", "input=test", out, *_trust(run)]
     steps.append(("predict", shell_command("predict", *words)))
     steps.append(("", "your own images: input=FOLDER, with the folders rgb and thermal in it"))
     counts = folder.path / counts_name("test")

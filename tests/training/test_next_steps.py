@@ -177,7 +177,7 @@ def test_printed_commands_work_as_pasted(tmp_path: Path) -> None:
     steps = steps_of(paste(first))
     assert Path(steps["look at"]).stat().st_size > 10_000
     assert "12 images in" in paste(steps["predict"])
-    assert len(list((folder / "predicted").glob("*_overlay.png"))) == 12
+    assert len(list(folder.glob("predicted/*/*_overlay.png"))) == 12
     after = steps_of(paste(steps["compare with"]))
     assert "mIoU" in paste(after["compare"])
     assert steps_of(paste(first))["compare"] != after["compare"], "now there is one to compare with"
