@@ -79,4 +79,4 @@ def test_readme_in_a_fresh_clone(clone: Path, variables: dict[str, str]) -> None
     assert re.search(r"^predict +\.venv/bin/rgbt predict run=", done.stdout, re.MULTILINE)
     assert re.search(r"^1 passed", done.stdout, re.MULTILINE)
     assert re.search(r"^predict +rgbt predict run=", done.stdout, re.MULTILINE), "now it is active"
-    assert len(list(clone.glob("predicted/*/*_overlay.png"))) == 100
+    assert len(list((clone / "predicted").glob("*_overlay.png"))) == 100
