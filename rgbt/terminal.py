@@ -89,7 +89,8 @@ def counting(what: str, total: int) -> Iterator[Callable[[], None]]:
             if bar.disable and now - written >= PAUSE_S:
                 written = now
                 left = timedelta(seconds=round((now - began) * (total - done) / done))
-                info(f"{what} {done} of {total}, {left} left")
+                # No message (`info`): the last one is why a job of a sweep failed.
+                sys.stderr.write(without_controls(f"{what} {done} of {total}, {left} left\n"))
 
         yield advance
 

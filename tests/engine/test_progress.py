@@ -130,8 +130,8 @@ def test_a_log_of_a_long_count_has_a_line_every_ten_seconds(
     for step in tracked(range(1000), "reading", 1000):
         now[0] += 0.125 if step < 400 else 0.0
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("rgbt: reading 80 of 1000, 0:01:55 left")
-    assert [line.split()[2] for line in lines] == ["80", "160", "240", "320", "400"]
+    assert lines[0].startswith("reading 80 of 1000, 0:01:55 left"), "no message of an error"
+    assert [line.split()[1] for line in lines] == ["80", "160", "240", "320", "400"]
 
 
 def test_a_terminal_shows_a_long_count_as_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
