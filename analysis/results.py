@@ -25,14 +25,13 @@ from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, tally, variance
-from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
+from rgbt.runs.folder import EXPERIMENT, GROUP, SEED, counts_name, find_run, is_finished, runs_in
 from rgbt.runs.result import COUNTS, RunResult
 from rgbt.terminal import info, tracked, warn
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"  # tags of runs
 ALL = "all"  # subset of all images of a split
 
 # Columns of `score_frame`, columns that say which counts they are of, and columns of `results`.

@@ -22,7 +22,7 @@ from rgbt.evaluation.images import batch_of
 from rgbt.evaluation.predict import Predictor
 from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import summary
-from rgbt.runs.folder import GROUP, find_run
+from rgbt.runs.folder import EXPERIMENT, GROUP, SEED, find_run
 from rgbt.runs.result import RunResult
 from rgbt.runs.specify import load_spec
 from rgbt.types import Batch, View
@@ -56,7 +56,7 @@ class Run(RunResult):
     @property
     def experiment(self) -> str:
         """Return the name of the experiment, for example "grbm"."""
-        return self.tags.get("rgbt.experiment", "")
+        return self.tags.get(EXPERIMENT, "")
 
     @property
     def group(self) -> str:
@@ -66,7 +66,7 @@ class Run(RunResult):
     @property
     def seed(self) -> int | None:
         """Return the seed of the run; None where the folder does not state it."""
-        text = self.tags.get("rgbt.seed", "")
+        text = self.tags.get(SEED, "")
         return int(text) if text else None
 
     @property

@@ -47,7 +47,8 @@ ADVICE = "restore it from a copy, or remove the run's folder to train it again"
 
 # Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
 # and the tag that the seeds of one configuration share.
-REPLACED, REPLACED_TAG, GROUP = "replaced", "rgbt.replaced", "rgbt.group"
+REPLACED, REPLACED_TAG = "replaced", "rgbt.replaced"
+GROUP, EXPERIMENT, SEED = "rgbt.group", "rgbt.experiment", "rgbt.seed"  # tags of every run
 
 
 @dataclass(frozen=True)

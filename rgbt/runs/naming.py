@@ -14,7 +14,7 @@ from contextlib import suppress
 
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
-from rgbt.runs.folder import GROUP, Description, lists_of
+from rgbt.runs.folder import EXPERIMENT, GROUP, SEED, Description, lists_of
 from rgbt.runs.run_spec import RunSpec
 
 # Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it.
@@ -68,9 +68,9 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
         if key not in SILENT and not key.rpartition("@")[2].startswith(EXTRA_MEASUREMENTS):
             words[key] = f"{key}{equals}{settings.get(key, value) if '${' in value else value}"
     tags = {
-        "rgbt.experiment": spec.name,
+        EXPERIMENT: spec.name,
         GROUP: " ".join([spec.name, *words.values()]),
-        "rgbt.seed": str(spec.seed),
+        SEED: str(spec.seed),
         "rgbt.lists": lists_of(settings),
         **(extra_tags or {}),
     }

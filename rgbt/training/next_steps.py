@@ -12,7 +12,7 @@ from rgbt.config.compose import compose, flatten
 from rgbt.config.overrides import composing, words_of_run
 from rgbt.config.stored_config import checkouts, shipped_targets, targets
 from rgbt.metrics.counts import FEWEST, Counts
-from rgbt.runs.folder import GROUP, RunFolder, counts_name, lists_of
+from rgbt.runs.folder import GROUP, SEED, RunFolder, counts_name, lists_of
 from rgbt.runs.naming import describe
 from rgbt.runs.provenance import without_passwords
 from rgbt.runs.result import RunResult
@@ -69,8 +69,12 @@ def _trust(run: RunSpec) -> list[str]:
 
 
 def _other_run(run: RunSpec, folder: RunFolder) -> str:
-    """Return the key of the newest finished run of another method on the same images; "": none."""
-    own, group = _images(run.plain), describe(run).tags[GROUP]
+    """Return the key of a finished run of another method on the same images; "": none.
+
+    The newest of the same seed, or else the newest.
+    """
+    own, tags, found = _images(run.plain), describe(run).tags, dict[str, str]()
+    group = tags[GROUP]
     results = folder.path.parent.glob("*/result.json")
     for result in sorted(results, key=_time_of, reverse=True)[:NEWEST]:
         # A run that is damaged, moved or another user's is none to compare with.
@@ -79,8 +83,8 @@ def _other_run(run: RunSpec, folder: RunFolder) -> str:
             is_other_method = other.tags.get(GROUP, group) != group
             is_as_long = _steps(other.settings) == _steps(run.plain)
             if is_as_long and is_other_method and _images(other.settings) == own:
-                return other.key
-    return ""
+                found.setdefault(other.tags.get(SEED, ""), other.key)
+    return found.get(tags[SEED]) or next(iter(found.values()), "")
 
 
 def _time_of(path: Path) -> float:

@@ -10,6 +10,7 @@ from typing import cast, get_args
 from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.compose import DEFAULT_SCALE, available
 from rgbt.config.stored_config import check_words
+from rgbt.runs.folder import SEED
 from rgbt.runs.result import RunResult
 from rgbt.terminal import tracked
 from sweeps.judge.judged_table import RESAMPLES, JudgedTable, Resamplers
@@ -27,7 +28,7 @@ from sweeps.plan.table import (
 )
 from sweeps.point import Outcome, Point
 from sweeps.score.efficiency import network_sizes
-from sweeps.score.reader import ODD, SEED, RunReader
+from sweeps.score.reader import ODD, RunReader
 
 # How a table was run: scale, form, and the words that were typed for every row.
 Variant = tuple[str, Form, tuple[str, ...]]

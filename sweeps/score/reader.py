@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import EXPERIMENT, SEED
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from sweeps.plan.measurement import Words, counts_of, stored_at
 
-SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 EXTERNAL = "external.json"  # what the counts of a row that is not trained here depend on
 SYNTHETIC, REAL = "synthetic scenes", "real images"
 

@@ -16,12 +16,12 @@ from rgbt.checks import InputError, one_line
 from rgbt.metrics import names
 from rgbt.metrics.named import value
 from rgbt.metrics.scores import extremes
-from rgbt.runs.folder import GROUP, RunFolder, runs_in
+from rgbt.runs.folder import EXPERIMENT, GROUP, SEED, RunFolder, runs_in
 from rgbt.runs.naming import short_word
 from rgbt.runs.result import RunResult
 from rgbt.tables import number
 from sweeps.run.progress import duration
-from sweeps.score.reader import EXPERIMENT, SEED, RunReader
+from sweeps.score.reader import RunReader
 from sweeps.show.sections import ODD, number_of, public, short_names
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from rgbt.checks import InputError, one_line
 from rgbt.config.compose import DEFAULT_SCALE
 from rgbt.metrics import names
 from rgbt.metrics.named import value
-from rgbt.runs.folder import GROUP
+from rgbt.runs.folder import GROUP, SEED
 from rgbt.runs.provenance import commit_of, without_passwords
 from rgbt.runs.result import RunResult
 from rgbt.tables import ABSENT, TextTable, number
@@ -23,7 +23,7 @@ from sweeps.judge.judged_table import JudgedTable
 from sweeps.plan.request import TAG
 from sweeps.run.progress import duration
 from sweeps.score.efficiency import million_parameters
-from sweeps.score.reader import SEED, RunReader
+from sweeps.score.reader import RunReader
 from sweeps.show.agreement import agreement_lines, forest_of
 from sweeps.show.claims import claim_grids, claim_lines, claims_frame, counted
 from sweeps.show.effects import effects_grids

@@ -113,7 +113,9 @@ def test_run_to_compare_with_has_the_same_images_and_another_method(tmp_path: Pa
     finished("+experiment=baseline", "trainer.max_steps=2")
     (finished("+experiment=baseline").folder / "config.yaml").unlink()  # damaged
     assert "compare" not in dict(next_steps(run, run_folder(run.folder)))
+    finished("+experiment=baseline", "seed=1")
     other = finished("+experiment=crm")
+    finished("+experiment=baseline", "seed=2")  # newer, and of another seed
     command = dict(next_steps(run, run_folder(run.folder)))["compare"]
     expected = [f"a={other.key}", f"b={run.key}", f"runs_dir={tmp_path}"]
     assert shlex.split(command)[-3:] == expected
