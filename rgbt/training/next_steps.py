@@ -73,18 +73,22 @@ def _other_run(run: RunSpec, folder: RunFolder) -> str:
 
     The newest of the same seed, or else the newest.
     """
-    own, tags, found = _images(run.plain), describe(run).tags, dict[str, str]()
-    group = tags[GROUP]
+    tags, fallback = describe(run).tags, ""
     results = folder.path.parent.glob("*/result.json")
     for result in sorted(results, key=_time_of, reverse=True)[:NEWEST]:
         # A run that is damaged, moved or another user's is none to compare with.
         with suppress(InputError, OSError):
             other = RunResult(result.parent)
-            is_other_method = other.tags.get(GROUP, group) != group
-            is_as_long = _steps(other.settings) == _steps(run.plain)
-            if is_as_long and is_other_method and _images(other.settings) == own:
-                found.setdefault(other.tags.get(SEED, ""), other.key)
-    return found.get(tags[SEED]) or next(iter(found.values()), "")
+            is_of_seed = other.tags.get(SEED) == tags[SEED]
+            is_other_method = other.tags.get(GROUP, tags[GROUP]) != tags[GROUP]
+            # Settings are read last: a long YAML file each.
+            is_wanted = is_other_method and (is_of_seed or not fallback)
+            if not is_wanted or not _is_comparable(run.plain, other.settings):
+                continue
+            if is_of_seed:
+                return other.key
+            fallback = other.key
+    return fallback
 
 
 def _time_of(path: Path) -> float:
@@ -93,8 +97,10 @@ def _time_of(path: Path) -> float:
     return 0.0
 
 
-def _steps(settings: Mapping[str, Any]) -> object:
-    return settings.get("trainer", {}).get("max_steps")
+def _is_comparable(own: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two runs took as many steps, and have the same images."""
+    steps = [settings.get("trainer", {}).get("max_steps") for settings in (own, other)]
+    return steps[0] == steps[1] and _images(own) == _images(other)
 
 
 def _images(settings: Mapping[str, Any]) -> tuple[object, ...]:

@@ -38,8 +38,8 @@ METRICS = (names.MIOU, names.VAR)
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
 # A path from the root of a machine; addresses of pages and relative paths do not match.
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
-# End of the override that chooses the fold of a seed (`sweeps.plan.table.Table.of_fold`).
-FOLD = re.compile(r"(?<=\w)_fold\d+(?= |$)")
+# The override that chooses the fold of a seed (`sweeps.plan.table.Table.of_fold`).
+FOLD = re.compile(r"( dataset=\w+?)_fold\d+(?= |$)")
 # Errors that a record may raise that somebody has edited.
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 
@@ -198,7 +198,7 @@ def _scores(run: RunResult, reader: RunReader) -> dict[str, Any]:
     tags, counts, origin = run.tags, reader.counts(run, ()), reader.origin(run)
     tables = [tag.removeprefix(TAG) for tag in tags if tag.startswith(TAG)]
     group = tags.get(GROUP, run.key)
-    method = FOLD.sub("", group)
+    method = FOLD.sub(r"\1", group)
     return {
         "method": method,
         "dataset": counts.dataset if method == group else "",  # its folds are seeds of a method

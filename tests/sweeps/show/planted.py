@@ -11,7 +11,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from rgbt.metrics.counts import Counts
-from rgbt.runs.folder import RunFolder
+from rgbt.runs.folder import RunFolder, read_description
 from rgbt.runs.naming import describe
 from sweeps.plan.planner import Planner
 from sweeps.plan.request import make_request, row_digests
@@ -38,6 +38,13 @@ def with_rings(counts: Counts) -> Counts:
     empty = np.zeros_like(counts.counts, shape=(len(counts.names), 3, *counts.counts.shape[2:]))
     both = np.concatenate([counts.counts, empty], 1)
     return remeasured(replace(counts, counts=both), partition="ring5")
+
+
+def set_tag(folder: Path, tag: str, text: str) -> None:
+    """Change a tag of a run."""
+    known = read_description(folder)
+    assert known is not None
+    RunFolder(folder).describe(replace(known, tags={**known.tags, tag: text}))
 
 
 def plant(

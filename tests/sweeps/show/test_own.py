@@ -15,7 +15,7 @@ import pytest
 from analysis.results import finished_runs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import extremes
-from rgbt.runs.folder import GROUP, RunFolder, read_description
+from rgbt.runs.folder import GROUP, RunFolder
 from rgbt.tracking.pictures import write_strip
 from rgbt.types import Sample
 from sweeps.score.reader import RunReader
@@ -23,7 +23,7 @@ from sweeps.show.html import html_page
 from sweeps.show.own import own_section
 from tests.browser import CHROMIUM, open_page
 from tests.measured import remeasured, store
-from tests.sweeps.show.planted import plant
+from tests.sweeps.show.planted import plant, set_tag
 
 TABLE3 = {"CRM baseline": (50.0, 51.0), "Ny/4": (60.0,)}
 DATASET: Any = SimpleNamespace(classes=("road", "car"), palette=((0, 0, 0), (64, 0, 128)))
@@ -43,18 +43,6 @@ def finish(folder: Path, time: int) -> None:
         label = rng.integers(0, 2, (24, 32)).astype(np.uint8)
         sample = Sample(rgb=rgb, thermal=rgb[..., 0], label=label, name=name)
         write_strip(sample, label, DATASET, run.figure_path(word))
-
-
-def tag(folder: Path, name: str, text: str) -> None:
-    """Change a tag of a run."""
-    known = read_description(folder)
-    assert known is not None
-    RunFolder(folder).describe(replace(known, tags={**known.tags, name: text}))
-
-
-def group(folder: Path, name: str) -> None:
-    """Change the group of a run."""
-    tag(folder, GROUP, name)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +110,7 @@ def test_methods_are_named_by_short_words(
     folders = [path.parent for path in sorted(runs.glob("*/run.json"))]
     shutil.rmtree(folders[2])
     for folder, override in zip(folders, overrides, strict=False):
-        group(folder, f"grbm {override} scale=bench")
+        set_tag(folder, GROUP, f"grbm {override} scale=bench")
     assert {run["label"] for run in section(runs)[0]["own"]} == named
 
 
@@ -135,7 +123,7 @@ def test_methods_are_named_by_short_words(
 )
 def test_methods_of_long_and_odd_names_stay_apart(runs: Path, names: Sequence[str]) -> None:
     for path, name in zip(sorted(runs.glob("*/run.json")), names, strict=True):
-        group(path.parent, name)
+        set_tag(path.parent, GROUP, name)
     (kind,) = section(runs)[0]["kinds"]
     assert [*kind["codes"]] == ["M1", "M2", "M3"]
 
@@ -144,8 +132,8 @@ def test_runs_of_one_seed_are_no_seeds_of_one_method(runs: Path) -> None:
     """Their overrides are alike, and the files of their settings were changed in between."""
     keys = [path.parent.name for path in sorted(runs.glob("*/run.json"))]
     for key, seed in zip(keys, "110", strict=True):
-        group(runs / key, "grbm")
-        tag(runs / key, "rgbt.seed", seed)
+        set_tag(runs / key, GROUP, "grbm")
+        set_tag(runs / key, "rgbt.seed", seed)
     own, _ = section(runs)
     assert {run["key"]: run["line"] for run in own["own"]} == {
         keys[0]: f"grbm · {keys[0]}",
@@ -219,7 +207,7 @@ def test_missing_wrong_and_damaged_things_are_named(runs: Path) -> None:
 
 def test_text_of_a_run_is_no_markup(runs: Path) -> None:
     for path in runs.glob("*/run.json"):
-        group(path.parent, "_<img src=http://evil.example/x.png> $x^{")
+        set_tag(path.parent, GROUP, "_<img src=http://evil.example/x.png> $x^{")
     own, remarks = section(runs)
     assert remarks == []
     image = "![x](http://evil.example/y.png) <b onclick=a>"

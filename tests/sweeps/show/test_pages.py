@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ import yaml
 from analysis.archive import _compared, add
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.runs.folder import RunFolder, read_description
+from rgbt.runs.folder import GROUP, RunFolder
 from rgbt.runs.result import RunResult
 from sweeps.report import entry
 from sweeps.score.reader import RunReader
@@ -33,7 +32,7 @@ from tests.analysis.counts import result_of
 from tests.commands import Call
 from tests.measured import remeasured
 from tests.models.external.standins import STACKED, write_checkout
-from tests.sweeps.show.planted import plant
+from tests.sweeps.show.planted import plant, set_tag
 
 PAPERS = ("crm", "multihead", "spatialseg", "temporal")
 
@@ -237,19 +236,13 @@ def test_html_loads_nothing_and_runs_its_own_script(html: str) -> None:
 
 
 ODD: dict[str, Callable[[Path], object]] = {
-    "seed": lambda run: edit(run / "run.json", "rgbt.seed", "nan"),
+    "seed": lambda run: set_tag(run, "rgbt.seed", "nan"),
     "tags": lambda run: (run / "run.json").write_text('{"name": 1, "tags": [], "params": {}}'),
     "config": lambda run: (run / "config.yaml").write_text("- [a list"),
     "counts": lambda run: (run / "counts_test.npz").write_bytes(b"PK damaged"),
     "time": lambda run: (run / "provenance.json").write_text("[7]"),
     "seconds": lambda run: (run / "result.json").write_text('{"seconds_of_last_process": "x"}'),
 }
-
-
-def edit(file: Path, tag: str, text: str) -> None:
-    known = read_description(file.parent)
-    assert known is not None
-    RunFolder(file.parent).describe(replace(known, tags={**known.tags, tag: text}))
 
 
 def test_odd_records_are_remarks_and_not_the_end(
@@ -271,12 +264,9 @@ def test_folds_of_a_data_set_are_seeds_of_one_method(place: Path, tmp_path: Path
     chosen = [path for path in (place / "runs").glob("*/run.json") if "my/pl" in path.read_text()]
     for path in chosen:
         folder = Path(shutil.copytree(path.parent, tmp_path / path.parent.name))
-        known = read_description(folder)
-        assert known is not None
-        seed = known.tags["rgbt.seed"]
-        row = known.tags["rgbt.table/my/planted"]
-        group = f"{row} dataset=mine_fold{seed} dataset.root=a_fold1/b"
-        edit(folder / "run.json", "rgbt.group", group)
+        tags = RunResult(folder).tags
+        seed, row = tags["rgbt.seed"], tags["rgbt.table/my/planted"]
+        set_tag(folder, GROUP, f"{row} dataset=mine_fold{seed} dataset.root=a_fold1/b")
         counts = remeasured(Counts.load(folder / "counts_test.npz"), dataset=seed)
         counts.save(folder / "counts_test.npz")  # each has images of its own
         result = {**RunResult(folder).result, **result_of(folder.name, counts)}
@@ -285,6 +275,11 @@ def test_folds_of_a_data_set_are_seeds_of_one_method(place: Path, tmp_path: Path
     (grid,) = runs_section(runs, RunReader(runs), [])["runs"]
     assert "| `low` | 0, 1, 2 | " in grid
     assert "All of them with `dataset=mine dataset.root=a_fold1/b`." in grid
+    for run in runs:
+        set_tag(run.folder, GROUP, f"low masker=mine_fold{run.tags['rgbt.seed']}")
+    runs = [RunResult(run.folder) for run in runs]
+    (grid,) = runs_section(runs, RunReader(runs), [])["runs"]
+    assert "| `low masker=mine_fold1` | 1" in grid, "that is another method"
 
 
 def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) -> None:
@@ -300,7 +295,7 @@ def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -
     shutil.copytree(place / "runs", tmp_path / "runs")
     files = sorted((tmp_path / "runs").glob("*/run.json"))
     file = next(file for file in files if "my/planted" in file.read_text())
-    edit(file, "rgbt.group", "<script>alert(1)</script> /home/me/secret/data | x")
+    set_tag(file.parent, "rgbt.group", "<script>alert(1)</script> /home/me/secret/data | x")
     found = made(tmp_path / "runs")
     page = found.html()
     assert "<script>alert" not in page + found.page("index")
