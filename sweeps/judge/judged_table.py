@@ -18,7 +18,6 @@ from analysis.uncertainty.contrasts import FIXED, Evidence, Resampler, Term
 from analysis.uncertainty.same_images import Alike
 from analysis.uncertainty.verdicts import Verdict, decide
 from rgbt.checks import InputError
-from rgbt.metrics import names
 from rgbt.runs.result import RunResult
 from sweeps.judge.contrasts import (
     Cell,
@@ -146,10 +145,7 @@ class JudgedTable:
                 raise InputError(f"column '{column.name}' is not a score of images.")
             words = words_of(column, table)
             if cell.world:
-                plain = Column(name=names.MIOU, metric=names.MIOU)
-                if words != words_of(plain, table):
-                    raise InputError(f"'{column.name}' is no score of the plain test images.")
-                words = world_words(table, row)[cell.world]
+                words = world_words(column, table, row)[cell.world]
             # Another table may have trained further seeds, without this measurement.
             counted = {s: run for s, run in runs.items() if self.reader.has_counts(run, words)}
             used = counted or runs

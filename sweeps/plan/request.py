@@ -139,14 +139,13 @@ class TableRequest:
 
     def evaluations(self, labels: Collection[str]) -> tuple[Words, ...]:
         """Return the measurements that the rows `labels` need beside the test of their runs."""
-        rows = [row for row in self.table.runnable_rows if row.label in labels]
-        names = {column.name for row in rows for column in self.table.columns_of(row)}
         needed: dict[Words, None] = {}
-        for column in self.table.columns:
-            if is_counted(column) and column.name in names:
+        for row in self.table.runnable_rows:
+            if row.label not in labels:
+                continue
+            for column in filter(is_counted, self.table.columns_of(row)):
                 needed[words_of(column, self.table)] = None
-        for row in rows:
-            needed |= dict.fromkeys(world_words(self.table, row).values())
+                needed |= dict.fromkeys(world_words(column, self.table, row).values())
         return tuple(words for words in needed if words)
 
     def runs(self, outcomes: Sequence[Outcome]) -> dict[RowSeed, Outcome]:

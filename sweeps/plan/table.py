@@ -246,6 +246,9 @@ class Table(Strict):
                 known.append(column.name)
         for name in self.design.outcomes if self.design else ():
             check_choice("design.outcomes", name, self._names)
+        of_pairs = [column.name for column in self.columns if column.frames is not None]
+        if of_pairs and self.design and self.design.tested:
+            raise ValueError(f"column '{of_pairs[0]}': pairs of frames are not tested in worlds.")
 
     def _check_rows(self) -> None:
         printed = [column.name for column in self.columns if column.printed]
@@ -402,9 +405,9 @@ def words_of(column: Column, table: Table) -> Words:
     return tuple(f"{key}={value}" for key, value in given.items() if value not in usual)
 
 
-def world_words(table: Table, row: Row) -> dict[str, Words]:
-    """Return the measurement of the row's network in every world of `Row.tested_in`, by name."""
-    usual = words_of(Column(name=names.MIOU, metric=names.MIOU), table)
+def world_words(column: Column, table: Table, row: Row) -> dict[str, Words]:
+    """Return the measurement that a column needs in every world of `Row.tested_in`, by name."""
+    usual = words_of(column, table)
     return {name: (*usual, *overrides) for name, overrides in row.tested_in.items()}
 
 

@@ -162,7 +162,7 @@ def test_claim_is_about_one_part_of_a_design() -> None:
 
 def test_networks_tested_in_worlds_use_counts_of_each() -> None:
     table = design_table(trained=None, tested=Part())
-    worlds = world_words(table, table.rows[0])
+    worlds = world_words(table.columns[0], table, table.rows[0])
     assert list(worlds) == list(CELLS)
     runs = {}
     for seed in (0, 1):
@@ -172,3 +172,21 @@ def test_networks_tested_in_worlds_use_counts_of_each() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
+
+
+def test_corrupted_images_of_worlds_have_counts_of_their_own() -> None:
+    """Noise makes the intact images worse, and those without RGB better."""
+    made = design_table(trained=None, tested=Part())
+    without = Column(name="two", metric="region/1", corruption="removed:rgb")
+    made = replace(made, columns=(made.columns[0], without, made.columns[2]))
+    intact, removed = (world_words(column, made, made.rows[0]) for column in made.columns[:2])
+    runs = {}
+    for seed in (0, 1):
+        counts: dict[Any, Counts] = {(): with_rates(0.5, 0.5)}
+        for cell, rate in RATES.items():
+            counts[intact[cell]] = with_rates(rate, 0.9)
+            counts[removed[cell]] = with_rates(1.3 - rate, 0.9)
+        runs["baseline natural", seed] = outcome(f"run{seed}", counts)
+    found = estimates(made, runs)
+    intact_effect, removed_effect = iou(0.8) - iou(0.9), iou(0.5) - iou(0.4)
+    assert found["baseline", "", "noise"].value == pytest.approx(intact_effect - removed_effect)

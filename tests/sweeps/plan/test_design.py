@@ -93,6 +93,25 @@ def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> 
     assert point.evaluations[2:] == tuple(("regions=ring9", *words) for words in worlds[1:])
 
 
+def test_worlds_measure_what_the_columns_ask_for(tmp_path: Path) -> None:
+    table = load_table(write(tmp_path))
+    without = replace(table.columns[0], name="no_rgb", corruption="removed:rgb")
+    table = replace(table, columns=(*table.columns, without))
+    request = TableRequest("my/design", table, "demo", (0,))
+    (point,) = (point for point in request.points() if point.label == "crm natural seed=0")
+    worlds = tuple(table.rows[9].tested_in.values())
+    removed = tuple(("corruption=removed:rgb", *words) for words in worlds)
+    assert point.evaluations == (*worlds, ("corruption=removed:rgb",), *removed)
+
+
+def test_pairs_of_frames_are_not_tested_in_worlds(tmp_path: Path) -> None:
+    columns = [*FILE["columns"], {"name": "TC", "metric": "TC", "frames": "aligned"}]
+    path = tmp_path / "design.yaml"
+    path.write_text(yaml.safe_dump({**FILE, "columns": columns, "design": DESIGN}))
+    with pytest.raises(InputError, match="'TC': pairs of frames"):
+        load_table(str(path))
+
+
 def design(generators: dict[str, str], letters: str = "OCNS") -> Design:
     factors = tuple(
         DesignFactor(letter=letter, name=letter.lower(), low_means="", high_means="")
