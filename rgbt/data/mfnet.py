@@ -40,6 +40,7 @@ SPLITS: dict[str, str | tuple[str, ...]] = {
     split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")
 }
 
+TIMES = ("day", "night")  # last words of splits by time of day, such as train_day
 MIRRORED = "_flip"
 NEXT = "next"
 
@@ -51,7 +52,8 @@ class MFNet(FileDataset):
         packed:  images/NAME.png with channels R, G, B, thermal, and labels/NAME.png
         folders: RGB/NAME.png, Thermal/NAME.png (one channel, or three equal ones), Label/NAME.png
 
-    A name NAME_flip in a list is read from its own files; nothing is mirrored here.
+    A name NAME_flip in a list is read from its own files; nothing is mirrored here. A split without
+    a list of its own, such as train_day, has the images by day, or at night, of another.
 
     Source: MFNet (Ha et al., IROS 2017), archive ir_seg_dataset; the folders layout is the one of
     the SpatialSeg and Temporal downloads. Class 0 is trained and scored, as in published tables.
@@ -92,6 +94,27 @@ class MFNet(FileDataset):
     def frame(self, name: str) -> FrameFiles:
         """Return the files of `name`."""
         return self.patterns.frame(self.root, name, {"name": name})
+
+    def check_split(self, split: str) -> None:
+        """Refuse a split that is neither one of `splits` nor the day or the night of one."""
+        if self._whole(split) is None:
+            super().check_split(split)
+
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Return the names of a known split; those by time of day are taken from the whole."""
+        whole = self._whole(split)
+        if whole is None:
+            return self.lines(split)
+        names = self.lines(whole)
+        nights = self.nights(names) or ()
+        is_wanted = split.endswith(TIMES[1])
+        return tuple(n for n, night in zip(names, nights, strict=False) if night == is_wanted)
+
+    def _whole(self, split: str) -> str | None:
+        """The split whose images by day or night are wanted, where these have no list."""
+        whole, _, time = split.rpartition("_")
+        is_part = time in TIMES and split not in self.splits and whole in self.splits
+        return whole if is_part else None
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
         """Say which names end in N, not D; None if no name does, InputError if only some do."""

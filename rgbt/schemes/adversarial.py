@@ -16,7 +16,7 @@ from rgbt.losses.unlabelled import judged as judged_map
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, SchemeRecord, record_of
-from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
+from rgbt.schemes.domains import SCORES, Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
 DomainValue = Annotated[float, Interval(ge=-10, le=10)]
@@ -83,6 +83,7 @@ class Adversarial:
         setting = f"scheme.supervise_target={str(labels).lower()}"
         weighed = ("domains", "target_confidence", True, "scheme.weighed_by_confidence=true")
         return self.passes.record_with(
+            SCORES,
             Requirement("domains", "target_labels", labels, setting),
             *((Requirement(*weighed),) if self.weighed_by_confidence else ()),
             *record_of(self.others[CRITIC], Record).requires,

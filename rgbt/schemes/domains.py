@@ -22,6 +22,7 @@ from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Ph
 Gradients = Literal["apart", "kept", "together"]
 
 WHOLE_IMAGES = Requirement("masker", "hides_cells", False)  # for schemes without a masked pass
+SCORES = Requirement("model", "outputs", "scores")  # for schemes that read `scores`
 
 
 class ViewAndHead(Protocol):
@@ -85,11 +86,10 @@ class Passes:
     def record_with(
         self, *requires: Requirement, masked: Requirement = WHOLE_IMAGES, **provides: Any
     ) -> SchemeRecord:
-        """Return the record of a scheme of two domains and class scores, with a `masked` masker."""
+        """Return the record of a scheme of two domains, with a `masked` masker."""
         heads = ("domains", "separate_heads", True, f"scheme.gradients={self.gradients}")
         return SchemeRecord(
             requires=(
-                Requirement("model", "outputs", "scores"),
                 masked,
                 Requirement("domains", "num_domains", 2),
                 *((Requirement(*heads),) if self.gradients != "apart" else ()),

@@ -21,7 +21,7 @@ from rgbt.losses.unlabelled import WeightedBy, pseudo_labels
 from rgbt.processes import mean_count, own_draw
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Requirement, SchemeRecord
-from rgbt.schemes.domains import Passes, SourceAndTarget, draw_masks, scores
+from rgbt.schemes.domains import SCORES, Passes, SourceAndTarget, draw_masks, scores
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains, View
 
 TEACHER = "teacher"
@@ -125,6 +125,7 @@ class SelfTraining:
         setting = f"scheme.masked_weight={self.masked_weight:g}"
         distance = self.feature_distance
         return self.passes.record_with(
+            SCORES,
             Requirement("domains", "target_labels", False),
             Requirement("loss", "weighs_confidence", True),
             *(() if distance is None else distance.requires),

@@ -12,7 +12,7 @@ from rgbt.losses.unlabelled import guidance
 from rgbt.processes import mean_count, num_processes
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Requirement, SchemeRecord
-from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
+from rgbt.schemes.domains import SCORES, Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import IGNORE, GeneratorOf, Loss, Phase, TwoDomains
 
 
@@ -70,7 +70,8 @@ class UnlabelledTarget:
         """Require no labels of the target; for guidance, an auxiliary head."""
         setting = f"scheme.guidance_weight={self.guidance_weight:g}"
         guided = (Requirement("model", "auxiliary", True, setting),) if self.guidance_weight else ()
-        return self.passes.record_with(Requirement("domains", "target_labels", False), *guided)
+        unlabelled = Requirement("domains", "target_labels", False)
+        return self.passes.record_with(SCORES, unlabelled, *guided)
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """Yield one phase, or one per optimiser."""

@@ -63,6 +63,19 @@ def test_lists(write_mfnet) -> None:
     assert "split 'test' of mfnet is empty: expected no.txt" in said
 
 
+def test_day_or_night_of_a_split_needs_no_list(write_mfnet) -> None:
+    root = write_mfnet({"train": ["00003N", "00001D", "00002N_flip"], "test_day": ["00001D"]})
+    dataset = MFNet(str(root))
+    before = dataset.fingerprint()
+    assert dataset.names("train_night") == ("00003N", "00002N_flip")
+    assert dataset.names("train_day") == ("00001D",)
+    assert dataset.names("test_day") == ("00001D",), "its own list, not that of the test split"
+    assert dataset.fingerprint() == before
+    for split in ("train_dusk", "train_day_night", "trial_day"):
+        assert f"no split '{split}'" in refused(lambda split=split: dataset.names(split))
+    assert "split 'val_day' of mfnet is empty" in refused(lambda: dataset.names("val_day"))
+
+
 def test_day_and_night(write_mfnet) -> None:
     dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
     names = ("00001D", "00001N", "00001D_flip", "00001N_flip")

@@ -132,6 +132,14 @@ def test_supervised_shows_the_domain_to_its_head() -> None:
     assert phase.optimizers == ("main",)
 
 
+def test_networks_without_class_scores_learn_labels_of_two_domains() -> None:
+    """Such as Mask2Former; its loss reads masks."""
+    model = network(False)
+    for scheme in (labelled(model, False, "apart"), unlabelled(model)):
+        required = {rule.key for rule in scheme.record.requires}
+        assert ("outputs" in required) == isinstance(scheme, UnlabelledTarget)
+
+
 # ---- adversarial: the same by matrices -----------------------------------------------------------
 
 PAPERS: dict[str, Any] = {
