@@ -64,12 +64,13 @@ def test_lists(write_mfnet) -> None:
 
 
 def test_day_or_night_of_a_split_needs_no_list(write_mfnet) -> None:
-    root = write_mfnet({"train": ["00003N", "00001D", "00002N_flip"], "test_day": ["00001D"]})
+    train = ["00003N", "00001D", "00002N_flip"]
+    root = write_mfnet({"train": train, "test": ["00001D"], "test_day": ["00004D"]})
     dataset = MFNet(str(root))
     before = dataset.fingerprint()
     assert dataset.names("train_night") == ("00003N", "00002N_flip")
     assert dataset.names("train_day") == ("00001D",)
-    assert dataset.names("test_day") == ("00001D",), "its own list, not that of the test split"
+    assert dataset.names("test_day") == ("00004D",), "its own list, not that of the test split"
     assert dataset.fingerprint() == before
     for split in ("train_dusk", "train_day_night", "trial_day"):
         assert f"no split '{split}'" in refused(lambda split=split: dataset.names(split))
