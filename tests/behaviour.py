@@ -3,7 +3,8 @@
 ``python -m tests.behaviour record FILE.json`` trains ten steps of every experiment at smoke size
 and writes losses as exact hexadecimal floats and counts as digests. ``compare A.json B.json``
 prints one line per experiment and exits with 1 if anything differs. ``tests/behaviour.json`` is
-the recording of the repository; write it again where a change is meant to alter behaviour.
+the recording of the repository; write it again where a change is meant to alter behaviour. An
+experiment that was recorded later, on another machine, names that machine.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ TEMPORAL = ("+experiment=temporal_con", "masker.patch_size=null")
 
 RUN = [
     *(
-        ("+experiment=gbrm", "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 71"),
+        ("+experiment=gbrm", "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 72"),
         ("optimizer.lrr=1", "'optimizer.lrr'"),
     ),
     *(("+loss.spatial.alfa=1", "'loss.spatial.alfa'"), ("+sead=1", "'sead'")),
