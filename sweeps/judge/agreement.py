@@ -178,10 +178,11 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
     Contrasts without printed values do not count, and one alone is no share.
 
     Returns:
-        the columns `SIGNS`: alike of so many contrasts have the printed sign; low and high are the
-        ends of the 95 % interval of the share, with tables drawn anew, because the contrasts of a
-        table share rows (NaN for one table); decided: those whose interval excludes 0, and
-        decided_alike of them with the printed sign.
+        the columns `SIGNS`, real images before synthetic scenes, the most contrasts first: alike of
+        so many contrasts have the printed sign; low and high are the ends of the 95 % interval of
+        the share, with tables drawn anew, because the contrasts of a table share rows (NaN for one
+        table); decided: those whose interval excludes 0, and decided_alike of them with the
+        printed sign.
     """
     import pandas as pd
 
@@ -198,6 +199,7 @@ def signs_of(contrasts: pd.DataFrame) -> pd.DataFrame:
         ends = _share_interval(by_table.sum().to_numpy(), by_table.size().to_numpy())
         of_decided = ((alike & decided).sum(), decided.sum())
         found.append((images, scale, alike.sum(), known.sum(), *ends, *of_decided))
+    found.sort(key=lambda row: (row[0].split()[0], -row[3]))
     return pd.DataFrame(found, columns=SIGNS)
 
 

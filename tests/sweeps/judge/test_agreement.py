@@ -121,6 +121,14 @@ def test_contrasts_without_print_are_known_and_do_not_count_as_printed() -> None
         assert "| own: y - x, mIoU | - | +9.67*" in sides
 
 
+def test_most_contrasts_on_real_images_are_said_first() -> None:
+    one = contrasts_frame([made("p/one", SHARES)])
+    counts = {"synthetic scenes": 3, "real images of a": 2, "real images of b": 3}
+    every = [one[:number].assign(images=images) for images, number in counts.items()]
+    found = signs_of(pd.concat(every))["images"].tolist()
+    assert found == ["real images of b", "real images of a", "synthetic scenes"]
+
+
 def test_no_interval_that_excludes_0_is_said() -> None:
     both = contrasts_frame([made("p/one", SHARES)])
     wide = both.assign(confirmed_low=-99.0, confirmed_high=99.0)
