@@ -24,7 +24,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
 from rgbt.cores import usable_cores
-from rgbt.data.file_dataset import FileDataset, SplitNames, evenly_spaced
+from rgbt.data.file_dataset import DAY_OR_NIGHT, FileDataset, SplitNames, evenly_spaced
 from rgbt.data.images import PairReader
 from rgbt.data.labels import PixelCounts, label_pixels, of_one_class
 from rgbt.data.thermal import TAIL, kind_of, mixed, points_of
@@ -379,7 +379,7 @@ def _kind_of(dataset: FileDataset, name: str) -> str:
 
 def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
     """Say what a split lacks that another split has: images by day or at night, or a class."""
-    whole = {split: r for split, r in splits.items() if not split.endswith(("_day", "_night"))}
+    whole = {split: r for split, r in splits.items() if not split.endswith(DAY_OR_NIGHT)}
     notes = []
     for split, r in whole.items():
         others = [other for name, other in whole.items() if name != split]

@@ -36,6 +36,9 @@ Lists = Mapping[str, str | tuple[str, ...]]
 # Beginning of the name of a list that comes with rgbt, and where these lists are.
 OURS, LISTS = "rgbt:", Path(__file__).with_name("lists")
 
+# Ends of the names of splits that are parts of another, "train_day" of "train".
+DAY_OR_NIGHT = ("_day", "_night")
+
 # Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
 
@@ -296,7 +299,7 @@ class FileDataset:
 
     def repeats(self, split: str) -> bool:
         """Say whether a split only repeats images of other splits, and need not exist."""
-        return split.endswith(("_day", "_night"))
+        return split.endswith(DAY_OR_NIGHT)
 
     def unused(self, lists: SplitNames) -> Collection[Path]:
         """Return files of the layout that belong to no image of a split."""

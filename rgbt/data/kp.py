@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import FileDataset, SplitNames
+from rgbt.data.file_dataset import DAY_OR_NIGHT, FileDataset, SplitNames
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
 from rgbt.data.patterns import FrameFiles, Pattern, Patterns
@@ -50,7 +50,7 @@ NIGHT_SETS = (3, 4, 5, 9, 10, 11)
 SETS_OF = {
     f"{split}{time}": tuple(n for n in sets if not time or (n in NIGHT_SETS) == (time == "_night"))
     for split, sets in SETS.items()
-    for time in ("", "_day", "_night")
+    for time in ("", *DAY_OR_NIGHT)
 }
 SPLITS = {split: f"{split}.txt" for split in SETS_OF}
 NAME = re.compile(r"(?P<set>set(?:0\d|1[01]))_(?P<video>V\d{3})_(?P<frame>I\d{5})")

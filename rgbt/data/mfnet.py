@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import FileDataset
+from rgbt.data.file_dataset import DAY_OR_NIGHT, FileDataset
 from rgbt.data.files import read_array
 from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
@@ -40,7 +40,6 @@ SPLITS: dict[str, str | tuple[str, ...]] = {
     split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")
 }
 
-TIMES = ("day", "night")  # last words of splits by time of day, such as train_day
 MIRRORED = "_flip"
 NEXT = "next"
 
@@ -107,14 +106,8 @@ class MFNet(FileDataset):
             return self.lines(split)
         names = self.lines(whole)
         nights = self.nights(names) or ()
-        is_wanted = split.endswith(TIMES[1])
+        is_wanted = split.endswith("_night")
         return tuple(n for n, night in zip(names, nights, strict=False) if night == is_wanted)
-
-    def _whole(self, split: str) -> str | None:
-        """The split whose images by day or night are wanted, where these have no list."""
-        whole, _, time = split.rpartition("_")
-        is_part = time in TIMES and split not in self.splits and whole in self.splits
-        return whole if is_part else None
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
         """Say which names end in N, not D; None if no name does, InputError if only some do."""
@@ -129,6 +122,12 @@ class MFNet(FileDataset):
     def repeats(self, split: str) -> bool:
         """Say that lists by time of day only repeat names of others, and need not exist."""
         return super().repeats(split) and not self.has(split)
+
+    def _whole(self, split: str) -> str | None:
+        """The split whose images by day or night are wanted, where these have no list."""
+        whole = split.rpartition("_")[0]
+        is_part = split.endswith(DAY_OR_NIGHT) and split not in self.splits and whole in self.splits
+        return whole if is_part else None
 
 
 class NextFrames:
